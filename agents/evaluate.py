@@ -280,7 +280,8 @@ def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, 
 
 
 TESTS: tuple[tuple[type[Task], Callable[..., dict[str, Any]], dict[str, Any]], ...] = (
-    (RingTask, evaluate_ring, {"shock": 4.0}), (FollowTask, evaluate_follow, {"reward": "source"}),
+    (RingTask, evaluate_ring, {"shock": 4.0, "shock_after": 120.0}),
+    (FollowTask, evaluate_follow, {"reward": "source"}),
     (OpenLanesTask, evaluate_lanes, {}),
 )  # fmt: skip
 """Kinds of tasks, how policies are judged in them, and keywords of the environment besides those of training."""

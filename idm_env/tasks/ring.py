@@ -27,7 +27,8 @@ from idm_env.validation import one_of, shown
 STARTS = ("uniform", "wave")
 SCALES = (5.0, 1.0, 10.0)
 """Of speed, relative speed (m/s) and headway (m) in an observation: what they are about in a grown wave."""
-_LENGTH_STREAM = 1
+_LENGTH_STREAM, _SHOCK_STREAM = 1, 2
+_MOST_SHOCKS = 32
 _FASTEST = 40.0
 """Speed (m/s) up to which a vehicle's own is observed and the mean is paid."""
 _FUEL = 5.0
@@ -39,8 +40,9 @@ class RingTask(Task):
     """21 human drivers and one controlled vehicle (or k of N) on a ring, after Sugiyama et al. 2008, New J. Phys. 10.
 
     The benchmark is WaveAttenuationPOEnv of Flow (Wu, Kreidieh, Parvate, Vinitsky, Bayen 2017, arXiv 1710.05465),
-    with its figures: length from 220–270 m, Δt 0.1 s, warm-up 750 steps, horizon 3000, IDM v0 = 30, T = 1, a = 1, b =
-    1.5, δ = 4, s0 = 2, noise 0.2, command ±1 m/s². In the warm-up everybody is a human driver.
+    with its figures: length from 220–270 m, Δt 0.1 s, horizon 3000, IDM v0 = 30, T = 1, a = 1, b = 1.5, δ = 4, s0 = 2,
+    noise 0.2, command ±1 m/s². In the warm-up, 1500 steps in which a wave grows (Flow: 750), everybody is a human
+    driver. Once a minute a human brakes, so that waves come again; ``configs/ring.yaml`` is Flow's task to the letter.
 
     Observation, per agent: ``v/5, (v_lead − v)/1, headway/10`` (m/s, m/s, m), headway from front bumper to front
     bumper; raw: without the scales. Flow divides by 15, 15 and 270, so that its entries vary by 0.04, 0.004 and 0.002.
@@ -58,12 +60,13 @@ class RingTask(Task):
         tailgating_below: Time gap below which it counts (s). An agent holds about that gap: leave a margin.
         fuel: Weight of the fuel term of ``reward="flow"`` (s/mL); 0 leaves it out.
         fuel_model: Whose fuel: ``"kamal"`` or ``"circles"`` (``idm_env.metrics.FUELS``).
-        shock: Deceleration (m/s²) with which one human driver brakes in an episode, whatever is ahead: as hard as
-            the brakes allow, by a command in place of the driver's acceleration; 0 is no shock.
-        shock_after: Time from the beginning of the episode to the shock (s), or those of several, such as [60, 120].
-        shock_seconds: How long it lasts (s), in whole steps.
-        shock_vehicle: Who brakes; None is the human opposite the first agent, half the ring away (or the next one
-            behind, where that is an agent too).
+        shock: Deceleration (m/s²) with which a human driver brakes now and then, whatever is ahead: as hard as the
+            brakes allow, by a command in place of the driver's acceleration; 0 is no shock.
+        shock_every: Once in every so many seconds of an episode, at a drawn time, a drawn human driver brakes.
+        shock_after: Times from the beginning of the episode to shocks (s) in place of drawn ones, such as [60, 120].
+        shock_seconds: How long each lasts (s), in whole steps.
+        shock_vehicle: Who brakes; None is drawn, or with ``shock_after`` the human opposite the first agent, half the
+            ring away (or the next one behind, where that is an agent too).
     """
 
     name: ClassVar[str] = "ring"
@@ -73,12 +76,14 @@ class RingTask(Task):
         "idm": {"max_accel": 1.0, "comfort_decel": 1.5, "time_gap": 1.0, "min_gap": 2.0, "desired_speed": 30.0}
     }
 
+    begins_with: ClassVar[tuple[str, ...]] = ("length", "start")
     ranges: ClassVar[Mapping[str, Range]] = {
         "length": Range(1.0, 1e6, "m", ends=True),
         "tailgating": Range(0.0, 1e6),
         "tailgating_below": Range(0.1, 60.0, "s"),
         "fuel": Range(0.0, 1e6),
         "shock": Range(0.0, 100.0, "m/s²"),
+        "shock_every": Range(1.0, 1e6, "s"),
         "shock_after": Range(0.0, 1e6, "s", several=True),
         "shock_seconds": Range(0.0, 1e4, "s"),
         "shock_vehicle": Range(0, 100_000, whole=True),
@@ -86,14 +91,15 @@ class RingTask(Task):
 
     length: float | Sequence[float] = (220.0, 270.0)
     noise: float = 0.2
-    warmup: int = 750
+    warmup: int = 1500
     start: str = "uniform"
     tailgating: float = 0.0
     tailgating_below: float = 0.8
     fuel: float = 0.0
     fuel_model: str = "kamal"
-    shock: float = 0.0
-    shock_after: float | Sequence[float] = 120.0
+    shock: float = 4.0
+    shock_every: float = 60.0
+    shock_after: float | Sequence[float] | None = None
     shock_seconds: float = 2.0
     shock_vehicle: int | None = None
 
@@ -108,12 +114,14 @@ class RingTask(Task):
         one_of("start", self.start, STARTS)
         one_of("fuel_model", self.fuel_model, metrics.FUELS)
         at_least("shock_seconds", self.shock_seconds, self.simulator.dt, "s")
-        if any(later - sooner < self.shock_seconds for sooner, later in pairwise(self.shocks)) or not self.shocks:
+        at_least("shock_every", self.shock_every, self.shock_seconds, "s")
+        given = self.shock_after is not None
+        if given and (any(y - x < self.shock_seconds for x, y in pairwise(self.shocks)) or not self.shocks):
             raise ValueError(
                 f"shock_after = {shown(self.shock_after)} must be a time, or several, each at least shock_seconds = "
                 f"{self.shock_seconds:g} s after the one before, such as [60, 120]."
             )
-        if self.shock or self.shock_vehicle is not None:
+        if (self.shock and given) or self.shock_vehicle is not None:
             self._check_shocked()
         only_with(self, "flow", ("tailgating", "fuel"))
 
@@ -135,8 +143,24 @@ class RingTask(Task):
 
     @property
     def shocks(self) -> tuple[float, ...]:
-        """When a human driver brakes, where there is a shock (s)."""
-        return tuple(self.shock_after) if isinstance(self.shock_after, Sequence) else (self.shock_after,)
+        """The times that are given at which a human driver brakes (s)."""
+        after = self.shock_after
+        return () if after is None else tuple(after) if isinstance(after, Sequence) else (after,)
+
+    def _shocks(self, draw: Draw) -> dict[str, Tensor]:
+        """Return, of every shock of an episode, its first step and who brakes, each ``(environments, shocks)``."""
+        device, dt = draw.key.device, self.simulator.dt
+        humans = torch.tensor([i for i in range(self.vehicles) if i not in self.agents], device=device)
+        if not self.shock or not len(humans):
+            return {}
+        if self.shocks:
+            first = torch.tensor([round(t / dt) for t in self.shocks], device=device).expand(len(draw.key), -1)
+            return {"shock_step": first.contiguous(), "shock_who": torch.full_like(first, self.shocked)}
+        count = min(_MOST_SHOCKS, math.ceil(self.steps * dt / self.shock_every))
+        when, who = draw.uniforms(_SHOCK_STREAM, 2 * count, torch.float64).split(count, -1)
+        begin = (torch.arange(count, device=device) + when) * self.shock_every - when * self.shock_seconds
+        who = humans[(who * len(humans)).long()] if self.shock_vehicle is None else torch.full_like(who, self.shocked)
+        return {"shock_step": (begin / dt).long(), "shock_who": who.long()}
 
     @cached_property
     def shocked(self) -> int:
@@ -201,7 +225,7 @@ class RingTask(Task):
             circumference=length.squeeze(-1),
             step=torch.full((len(length),), -self.warmup, device=length.device),
         )
-        return EnvState(state, {})
+        return EnvState(state, self._shocks(draw))
 
     @cached_property
     def _leaders(self) -> tuple[int, ...]:
@@ -218,18 +242,17 @@ class RingTask(Task):
     ) -> Inputs:
         """Return the inputs of one step: those of every task, and the command of the human who brakes."""
         inputs = super().inputs(world, command, normals, live)
-        if not self.shock:
+        if "shock_step" not in world.episode:
             return inputs
-        step, dt = world.state.step.unsqueeze(-1), self.simulator.dt
-        lasts = round(self.shock_seconds / dt)
-        since = [step - round(begin / dt) for begin in self.shocks]
-        now = reduce(torch.logical_or, [(x >= 0) & (x < lasts) for x in since])
-        who = self.constant("shocked", self._is_shocked, step.device, torch.bool)
-        control, brakes = inputs["control"], now & who
+        step, lasts = world.state.step.unsqueeze(-1), round(self.shock_seconds / self.simulator.dt)
+        vehicle = self.constant("vehicle", range(self.vehicles), step.device, torch.int64)
+        first, who = world.episode["shock_step"], world.episode["shock_who"]
+        now = [
+            (step >= first[:, k : k + 1]) & (step < first[:, k : k + 1] + lasts) & (vehicle == who[:, k : k + 1])
+            for k in range(first.shape[-1])
+        ]
+        control, brakes = inputs["control"], reduce(torch.logical_or, now)
         return {**inputs, "control": Command(torch.where(brakes, -self.shock, control.accel), control.active | brakes)}
-
-    def _is_shocked(self) -> list[bool]:
-        return [i == self.shocked for i in range(self.vehicles)]
 
 
 def even(step: Transition) -> Tensor:

@@ -64,7 +64,7 @@ def test_a_wave_start_fits_the_ring():
 
 @pytest.mark.slow
 def test_without_control_the_wave_emerges_and_costs_a_third_of_the_speed():
-    task = make_task("ring", length=[220.0, 270.0])
+    task = make_task("ring", length=[220.0, 270.0], warmup=750, shock=0.0)
     with torch.no_grad():
         world, params = start(task, count=12)
         speeds = []
@@ -85,7 +85,7 @@ def test_without_control_the_wave_emerges_and_costs_a_third_of_the_speed():
 
 def test_a_policy_of_constant_speed_calms_the_traffic():
     # One vehicle that never exceeds 70 % of the equilibrium speed dissolves the wave, and all drive faster for it.
-    task = make_task("ring", length=250.0, start="wave", warmup=300, noise=0.0)
+    task = make_task("ring", length=250.0, start="wave", warmup=300, noise=0.0, shock=0.0)
     world, params = start(task)
     even = equilibrium_speed(torch.tensor(250.0 / 22 - 5.0, dtype=torch.float64), params["idm"])
     calm = even * 0.7
@@ -131,6 +131,23 @@ def test_in_a_shock_one_human_brakes_for_its_time_whatever_is_ahead():
     assert float(felt[-1, 12]) > 0.5
 
 
+def test_waves_come_again_at_drawn_times():
+    """In every minute of an episode one drawn human brakes, never an agent; in no two episodes alike."""
+    task = make_task("ring", warmup=0, controlled=2)
+    world, _ = start(task, count=200)
+    first, who = world.episode["shock_step"], world.episode["shock_who"]
+    assert first.shape == who.shape == (200, 5)
+    assert torch.equal(first // 600, torch.arange(5).expand(200, 5)) and int((first % 600).max()) <= 580
+    assert set(who.flatten().tolist()) == set(range(22)) - set(task.agents)
+    assert len({tuple(row) for row in first.tolist()}) == 200
+    assert (
+        make_task("ring", controlled="all")
+        .reset(Draw.of(torch.zeros(1).long(), torch.zeros(1).long()), make_task("ring").params(torch.float64, "cpu"))
+        .episode
+        == {}
+    )
+
+
 def test_gradients_flow_past_a_shock_and_not_into_it():
     speeds, push, time_gap = shocked_speeds()
     one = speeds[:, 0]
@@ -154,7 +171,8 @@ def test_the_driver_opposite_is_no_agent_and_a_wrong_one_is_told():
         ({"shock": 4.0, "shock_after": [60.0, -1.0]}, r"shock_after\[1\] = -1"),
         ({"shock": 4.0, "shock_after": [60.0, 61.0]}, "each at least shock_seconds = 2 s after the one before"),
         ({"shock": 4.0, "shock_after": []}, "must be a time, or several"),
-        ({"shock": 4.0, "controlled": "all"}, "needs a human driver"),
+        ({"shock": 4.0, "shock_after": 60.0, "controlled": "all"}, "needs a human driver"),
+        ({"shock_every": 1.0}, "shock_every = 1 s must be at least 2"),
         ({"shock": 4.0, "shock_vehicle": 0}, "shock_vehicle = 0 must be a human driver"),
         ({"shock": 4.0, "shock_vehicle": 22}, "shock_vehicle = 22 must be a human driver"),
     ):
