@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -123,6 +124,7 @@ class Batch:
         self._driven: Params | None = None
         self._pool: EnvState | None = None
         self._beginnings = Beginnings(self._begin, count)
+        self._beginner = settings.task
         self._block: dict[str, Tensor] | None = None
         self._drawn: dict[str, np.ndarray] = {}
         self.used = self._drawn_steps = 0
@@ -216,15 +218,24 @@ class Batch:
         device = self.settings.device
         return Draw.of(torch.as_tensor(self.seeds[rows], device=device), torch.as_tensor(episodes, device=device))
 
+    def choose(self, choices: Mapping[str, Any]) -> None:
+        """Begin episodes from now on with these of ``task.begins_with``; ValueError, nothing changed, for bad ones."""
+        if choices:
+            task = self._beginner
+            drawn = {name: x for name, x in (task.randomise or {}).items() if name not in choices}
+            self._beginner = replace(task, randomise=drawn or None, **choices)
+            self._pool = None
+            self._beginnings.forget()
+
     @torch.no_grad()
     def _begin(self, rows: np.ndarray, episodes: np.ndarray) -> EnvState:
         draw = self._draws(rows, episodes)
         if not self.task.warmup_pool:
-            return self.task.reset(draw, self.params)
+            return self._beginner.reset(draw, self.params)
         if self._pool is None:
             size, device = self.task.warmup_pool, self.settings.device
             seeds = torch.arange(size, device=device) + _LARGEST_POOL * self.task.warmup_pool_seed
-            self._pool = self.task.reset(Draw.of(seeds, torch.full_like(seeds, -1)), self.params)
+            self._pool = self._beginner.reset(Draw.of(seeds, torch.full_like(seeds, -1)), self.params)
         picked = (draw.uniforms(_POOL_STREAM, 1, torch.float64).squeeze(-1) * self.task.warmup_pool).long()
         return mapped(lambda pooled: pooled[picked], self._pool)
 

@@ -199,7 +199,8 @@ class DiffIDMEnv(Face, gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see the class for ``seed`` and ``options``."""
-        chosen = reset_options(options, ("state",))
+        chosen = reset_options(options, ("state", *self.task.begins_with))
+        self.batch.choose({name: x for name, x in chosen.items() if name in self.task.begins_with})
         super().reset(seed=seed)
         if seed is not None or not self.batch.begun:
             # Without any seed the one that Gymnasium draws from the operating system is used.

@@ -69,7 +69,8 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         A number seeds environment i with ``seed + i``; a sequence gives every one its own. ``options["state"]`` is a
         ``State`` to start from, one row per environment that is reset.
         """
-        chosen = reset_options(options, ("state", "reset_mask"))
+        chosen = reset_options(options, ("state", "reset_mask", *self.task.begins_with))
+        self.batch.choose({name: x for name, x in chosen.items() if name in self.task.begins_with})
         rows = self._masked(chosen.get("reset_mask"))
         self._seed(seed, rows)
         observation = self.batch.reset(rows, chosen.get("state"))

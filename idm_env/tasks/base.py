@@ -23,7 +23,7 @@ from idm_env.effects import Control, Effect, Noise
 from idm_env.roads import Road
 from idm_env.simulator import Simulator, stacked
 from idm_env.tasks.behaviour import Behaviour, behaviour
-from idm_env.tasks.checks import Range, agents_of, in_ranges, limits_of, ranges, ranges_of, whole
+from idm_env.tasks.checks import Range, agents_of, in_ranges, limits_of, ranges, ranges_of, two_ends, whole
 from idm_env.tasks.crash import contact, lawful_cost
 from idm_env.tasks.declared import one_declared
 from idm_env.tasks.failsafe import safe_accel
@@ -57,9 +57,9 @@ class Task(abc.ABC):
         drivers: Path of a ``model.yaml`` with single drivers, such as ``idm-env fit --by driver`` writes; it is used as
             in ``effects``, and in every episode every vehicle drives as one of them, drawn anew. What ``parameters``
             names is everybody's.
-        randomise: Ranges from which every episode draws parameters anew, evenly and for all its drivers alike (domain
-            randomisation): ``{"idm": {"time_gap": [0.8, 1.2]}}`` or ``{"idm.time_gap": [0.8, 1.2]}``; over
-            ``parameters`` and ``drivers``.
+        randomise: Ranges from which every episode draws anew, evenly: parameters, for all its drivers alike (domain
+            randomisation), ``{"idm": {"time_gap": [0.8, 1.2]}}`` or ``{"idm.time_gap": [0.8, 1.2]}``, over
+            ``parameters`` and ``drivers``; and the demand of open roads, ``{"inflow": [1500, 2500]}``.
         noise: Standard deviation of the drivers' noise N, added as ``accel += √Δt N(0, noise²)`` (m/s² per √s); 0 is
             none.
         warmup: Steps before an episode begins, in which nobody is controlled.
@@ -136,6 +136,10 @@ class Task(abc.ABC):
     """Time (s) for which an action is held where nothing is said; None: one Δt."""
     first_free: ClassVar[int] = 0
     """Vehicles before this one cannot be controlled: they are recorded."""
+    can_draw: ClassVar[tuple[str, ...]] = ()
+    """Keywords beside parameters that ``randomise`` takes."""
+    begins_with: ClassVar[tuple[str, ...]] = ()
+    """Keywords that only the beginning of an episode looks at: ``reset(options={…})`` takes them."""
 
     def __post_init__(self) -> None:
         in_ranges(self)
@@ -145,7 +149,7 @@ class Task(abc.ABC):
             raise ValueError(f"warmup_pool = {self.warmup_pool} has no use without warm-up. Give warmup=750 as well.")
         self._check_episode()
         self.params(torch.float64, "cpu")
-        _ = self._ranges, self.held
+        _ = self._demands, self._ranges, self.held
 
     def _check_episode(self) -> None:
         """Check what every task says of its commands, episodes and observations."""
@@ -356,13 +360,35 @@ class Task(abc.ABC):
     @cached_property
     def _ranges(self) -> dict[tuple[str, str], tuple[float, float]]:
         """What is drawn for every episode, and the ends of its range."""
-        spans = ranges_of(self.randomise)
+        spans = ranges_of(
+            {k: v for k, v in self.randomise.items() if k not in self.can_draw}
+            if isinstance(self.randomise, Mapping)
+            else self.randomise
+        )
         for end in (0, 1) if spans else ():
             values = {effect: dict(part) for effect, part in self._behaviour.parameters.items()}
             for (effect, name), ends in spans.items():
                 values.setdefault(effect, {})[name] = ends[end]
             ends_of = replace(self._behaviour, parameters=values)
             self.simulator.check(ends_of.params(self.vehicles, torch.float64, "cpu"))
+        return spans
+
+    @cached_property
+    def _demands(self) -> dict[str, tuple[float, float]]:
+        """What else is drawn for every episode, and the ends of its range."""
+        given = self.randomise if isinstance(self.randomise, Mapping) else {}
+        for name, value in given.items():
+            plain = isinstance(value, Sequence) and "." not in str(name) and name in ranges(type(self))
+            if plain and name not in self.can_draw:
+                own = f"{', '.join(self.can_draw)}, and " if self.can_draw else ""
+                raise ValueError(
+                    f"randomise.{name} cannot be drawn in task '{self.name}', where {own}parameters of drivers such as "
+                    "idm.time_gap can."
+                )
+        spans = {k: two_ends(f"randomise.{k}", v) for k, v in given.items() if k in self.can_draw}
+        for name, ends in spans.items():
+            for end in ends:
+                ranges(type(self))[name].check(f"randomise.{name}", end)
         return spans
 
     def _is_agent(self) -> list[bool]:

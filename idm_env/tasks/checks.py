@@ -106,10 +106,15 @@ def ranges_of(randomise: Mapping[str, Any] | None) -> dict[tuple[str, str], tupl
     spans = {}
     for effect, part in nested(randomise or {}, "randomise").items():
         for name, value in part.items():
-            if isinstance(value, str) or not isinstance(value, Sequence):
-                raise ValueError(f"randomise.{effect}.{name} = {shown(value)} must be [lowest, highest].")
-            spans[effect, name] = span(f"randomise.{effect}.{name}", value, -math.inf, "")
+            spans[effect, name] = two_ends(f"randomise.{effect}.{name}", value)
     return spans
+
+
+def two_ends(name: str, value: Any) -> tuple[float, float]:
+    """Return the ends of a range ``[lowest, highest]``. ValueError for anything else."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise ValueError(f"{name} = {shown(value)} must be [lowest, highest].")
+    return span(name, value, -math.inf, "")
 
 
 def limits_of(max_command: Any) -> tuple[float, float]:

@@ -124,6 +124,8 @@ class OpenLanesTask(LanesTask):
     }
 
     usual_hold: ClassVar[float | None] = 1.0
+    can_draw: ClassVar[tuple[str, ...]] = ("inflow",)
+    begins_with: ClassVar[tuple[str, ...]] = ("inflow",)
     ranges: ClassVar[Mapping[str, Range]] = {"entry_speed": Range(1.0, 70.0, "m/s"), "inflow": FLOW}
 
     vehicles: int = 120
@@ -152,6 +154,13 @@ class OpenLanesTask(LanesTask):
             return
         flows = self.inflows
         total = sum(flows.values())
+        round_trip, free = 3600.0 * self.vehicles / (total * self._busiest), (self.road.length or 0) / self.entry_speed
+        if self._demands and round_trip < free:
+            raise ValueError(
+                f"vehicles = {self.vehicles} makes a demand of {total * self._busiest:g} vehicles an hour impossible: "
+                f"every {round_trip:.0f} s each would enter anew, and the road takes {free:.0f} s. Take at least "
+                f"{math.ceil(total * self._busiest * free / 3600.0)}."
+            )
         for lane, flow in flows.items():
             at_least(f"inflow of lane {lane}", flow, 1.0, "vehicles an hour")
             if self.vehicles * flow < total:
@@ -159,6 +168,11 @@ class OpenLanesTask(LanesTask):
                     f"vehicles = {self.vehicles} leaves none for lane {lane}, where {flow:g} of {total:g} vehicles an "
                     f"hour enter. Take at least {math.ceil(total / flow)}, or a less uneven inflow."
                 )
+
+    @property
+    def ramp(self) -> int | None:
+        """The lane whose demand is ``ramp_inflow``."""
+        return None
 
     @property
     @abc.abstractmethod
@@ -274,6 +288,18 @@ class OpenLanesTask(LanesTask):
         # Shares that are rounded down leave a slot to spare: it never drives.
         return (*driving, *[(0.0, math.inf)] * (self.vehicles - len(driving)))
 
+    @property
+    def _busiest(self) -> float:
+        """By how much the highest demand that may be drawn exceeds that of the keywords."""
+        return max([1.0, *(high / getattr(self, name) for name, (_, high) in self._demands.items())])
+
+    def _demand(self, draw: Draw, lane: int) -> Tensor:
+        """Return the demand of a lane in each episode over that of the keywords, ``(environments, 1)``."""
+        name = "ramp_inflow" if lane == self.ramp else "inflow"
+        low, high = self._demands.get(name, (1.0, 1.0))
+        share = draw.stream(f"demand {name}").uniforms(0, 1, torch.float64)
+        return (low + (high - low) * share) / (getattr(self, name) if name in self._demands else 1.0)
+
     def _trips(self, draw: Draw, dtype: torch.dtype) -> Trips:
         """Return trips at random headways, of which the first began before the episode did, in the order of time."""
         device = draw.key.device
@@ -291,8 +317,9 @@ class OpenLanesTask(LanesTask):
             mine = torch.nonzero(some & (lane == k)).squeeze(-1)
             times = headway[:, mine].cumsum(-1)
             cycle = mean[mine[0]] * len(mine)
-            departs[:, mine] = times * (cycle / times[:, -1:])
-            again[:, mine] = cycle
+            cycles = cycle / self._demand(draw, k)
+            departs[:, mine] = times * (cycles / times[:, -1:])
+            again[:, mine] = cycles
         order = departs.argsort(dim=-1, stable=True)
         none = torch.zeros(shape, dtype=torch.int64, device=device)
         return Trips(
@@ -378,7 +405,7 @@ class OpenLanesTask(LanesTask):
         """One that began before the episode, one that is due at once, and one for every time that a slot's are due."""
         if self.table is not None:
             return 1
-        cycle = min(sum(mean for k, mean in self._slots if k == lane) for lane in self.inflows)
+        cycle = min(sum(mean for k, mean in self._slots if k == lane) for lane in self.inflows) / self._busiest
         return 2 + math.ceil((self.steps * self.simulator.dt + self.filled / self.entry_speed) / cycle)
 
     @cached_property
@@ -387,7 +414,7 @@ class OpenLanesTask(LanesTask):
         if self.table is not None:
             return float(self.vehicles)
         seconds = (self.steps + 10) * self.simulator.dt + self.filled / self.entry_speed
-        return 2.0 * self.vehicles + sum(self.inflows.values()) * seconds / 3600.0
+        return 2.0 * self.vehicles + self._busiest * sum(self.inflows.values()) * seconds / 3600.0
 
     @property
     def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:

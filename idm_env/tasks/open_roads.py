@@ -43,6 +43,9 @@ class OpenHighwayTask(OpenLanesTask):
         "exits_share": Range(0.0, 1.0),
     }
 
+    can_draw: ClassVar[tuple[str, ...]] = ("inflow", "ramp_inflow")
+    begins_with: ClassVar[tuple[str, ...]] = ("inflow", "ramp_inflow")
+
     lanes_count: int = 4
     length: float = 1000.0
     inflow: float = 5000.0
@@ -108,6 +111,11 @@ class OpenHighwayTask(OpenLanesTask):
         return {**values, "destination": {**values["destination"], **mine}}
 
     @property
+    def ramp(self) -> int | None:
+        """The on-ramp's lane."""
+        return 0 if self._ramps[0] else None
+
+    @property
     def inflows(self) -> Mapping[int, float]:
         """The same for each lane, and the on-ramp's."""
         first = self.road.count - self.lanes_count
@@ -132,6 +140,9 @@ class MergeTask(OpenLanesTask):
     name: ClassVar[str] = "merge"
     ranges: ClassVar[Mapping[str, Range]] = {"ramp_inflow": FLOW}
 
+    can_draw: ClassVar[tuple[str, ...]] = ("inflow", "ramp_inflow")
+    begins_with: ClassVar[tuple[str, ...]] = ("inflow", "ramp_inflow")
+
     inflow: float = 3000.0
     ramp_inflow: float = 800.0
 
@@ -139,6 +150,11 @@ class MergeTask(OpenLanesTask):
     def road(self) -> Lanes:  # type: ignore[override]
         """Two lanes of 900 m, and the ramp, which is lane 0."""
         return Lanes(3, length=900.0, ends=(on_ramp(0, begin=400.0, end=600.0, entry=100.0),))
+
+    @property
+    def ramp(self) -> int | None:
+        """The ramp's lane."""
+        return 0
 
     @property
     def inflows(self) -> Mapping[int, float]:

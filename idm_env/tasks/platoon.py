@@ -56,6 +56,7 @@ class PlatoonTask(BehindHeadTask):
     own_parameters: ClassVar = {
         "idm": {"max_accel": 0.6, "comfort_decel": 1.5, "time_gap": 1.0, "min_gap": 2.0, "desired_speed": 30.0}
     }
+    begins_with: ClassVar[tuple[str, ...]] = ("period",)
     ranges: ClassVar[Mapping[str, Range]] = {
         "speed": Range(0.0, 70.0, "m/s"),
         "disturbance": Range(1e-3, 35.0, "m/s"),

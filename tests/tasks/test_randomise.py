@@ -1,5 +1,6 @@
 """Parameters that every episode draws anew from ranges, for all its drivers alike: domain randomisation."""
 
+import re
 from pathlib import Path
 
 import gymnasium
@@ -87,4 +88,41 @@ def test_ranges_stand_over_parameters_and_single_drivers(tmp_path: Path) -> None
 def test_what_cannot_be_drawn_is_said_in_one_line(randomise: object, message: str) -> None:
     with pytest.raises(ValueError, match=message) as told:
         make_task("ring", randomise=randomise)
+    assert "\n" not in str(told.value)
+
+
+def test_demand_is_drawn_for_every_episode_and_given_at_a_reset() -> None:
+    """Within its range, each lane its own; ``reset(options=…)`` holds from then on."""
+    task = make_task("merge", randomise={"inflow": [1500, 3000], "ramp_inflow": [400, 800]})
+    draw = Draw.of(torch.arange(200), torch.zeros(200, dtype=torch.int64))
+    trips = task.begin(draw, task.params(torch.float64, "cpu")).state.lanes.trips
+    slots = [(trips.lane == k) & trips.again.isfinite() for k in range(3)]
+    hourly = [3600.0 * mine.sum(-1) / trips.again.masked_fill(~mine, 0.0).amax(-1) for mine in slots]
+    assert 395 < float(hourly[0].min()) < 420 and 780 < float(hourly[0].max()) < 815
+    assert 745 < float(hourly[1].min()) < 780 and 1450 < float(hourly[1].max()) < 1505
+    env = gymnasium.make("DiffIDM-v0", task="merge", randomise={"inflow": [2900, 3000]})
+    inside = []
+    for options in ({"inflow": 800}, None, {"inflow": 3500}):
+        env.reset(seed=0 if not inside else None, options=options)
+        inside.append(float(env.unwrapped.state.present.sum()))
+    assert max(inside[:2]) < 10.0 < inside[2]
+
+
+@pytest.mark.parametrize(
+    ("task", "randomise", "said"),
+    [
+        ("merge", {"inflow": [3000, 1500]}, "randomise.inflow = [3000, 1500] must rise"),
+        ("merge", {"inflow": 2000}, "randomise.inflow = 2000 must be [lowest, highest]"),
+        ("merge", {"inflow": [1000, 20000]}, "makes a demand of 25333.3 vehicles an hour impossible"),
+        (
+            "merge",
+            {"vehicles": [18, 26]},
+            "randomise.vehicles cannot be drawn in task 'merge', where inflow, ramp_inflow",
+        ),
+        ("ring", {"vehicles": [18, 26]}, "where parameters of drivers such as idm.time_gap can"),
+    ],
+)
+def test_what_cannot_be_drawn_is_told_with_what_can(task: str, randomise: dict[str, object], said: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(said)) as told:
+        make_task(task, randomise=randomise)
     assert "\n" not in str(told.value)
