@@ -102,7 +102,7 @@ class HighwayTask(LanesTask):
 
 
 def pace(step: Transition) -> Tensor:
-    """Return ``min(v, 40 m/s)/40 m/s``."""
+    """Return ``min(v, 40 m/s)/40 m/s``, ``(…, agents)``."""
     return step.task.pick(step.after.state.speed).clamp_max(FASTEST) / FASTEST
 
 

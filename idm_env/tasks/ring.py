@@ -256,7 +256,7 @@ class RingTask(Task):
 
 
 def even(step: Transition) -> Tensor:
-    """Return ``⟨min(v/v*, 1)⟩`` over all vehicles, ``v* = (mean gap − 2 m)/1 s``: 1 where all drive as one can."""
+    """Return ``⟨min(v/v*, 1)⟩`` over all vehicles, ``(…, 1)``, ``v* = (mean gap − 2 m)/1 s``: 1 where waves are gone."""
     state = step.after.state
     best = (state.gap.mean(-1, keepdim=True) - 2.0).clamp_min(0.5)
     return (state.speed / best).clamp_max(1.0).mean(-1, keepdim=True)
