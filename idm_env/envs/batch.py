@@ -222,8 +222,8 @@ class Batch:
         """Begin episodes from now on with these of ``task.begins_with``; ValueError, nothing changed, for bad ones."""
         if choices:
             task = self._beginner
-            drawn = {name: x for name, x in (task.randomise or {}).items() if name not in choices}
-            self._beginner = replace(task, randomise=drawn or None, **choices)
+            others = {name: x for name, x in (task.randomise or {}).items() if name not in choices}
+            self._beginner = replace(task, randomise=others or None, **choices)
             self._pool = None
             self._beginnings.forget()
 

@@ -376,8 +376,8 @@ class Task(abc.ABC):
     @cached_property
     def _demands(self) -> dict[str, tuple[float, float]]:
         """What else is drawn for every episode, and the ends of its range."""
-        given = self.randomise if isinstance(self.randomise, Mapping) else {}
-        for name, value in given.items():
+        choices = self.randomise if isinstance(self.randomise, Mapping) else {}
+        for name, value in choices.items():
             plain = isinstance(value, Sequence) and "." not in str(name) and name in ranges(type(self))
             if plain and name not in self.can_draw:
                 own = f"{', '.join(self.can_draw)}, and " if self.can_draw else ""
@@ -385,7 +385,7 @@ class Task(abc.ABC):
                     f"randomise.{name} cannot be drawn in task '{self.name}', where {own}parameters of drivers such as "
                     "idm.time_gap can."
                 )
-        spans = {k: two_ends(f"randomise.{k}", v) for k, v in given.items() if k in self.can_draw}
+        spans = {k: two_ends(f"randomise.{k}", v) for k, v in choices.items() if k in self.can_draw}
         for name, ends in spans.items():
             for end in ends:
                 ranges(type(self))[name].check(f"randomise.{name}", end)

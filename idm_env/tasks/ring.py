@@ -115,13 +115,13 @@ class RingTask(Task):
         one_of("fuel_model", self.fuel_model, metrics.FUELS)
         at_least("shock_seconds", self.shock_seconds, self.simulator.dt, "s")
         at_least("shock_every", self.shock_every, self.shock_seconds, "s")
-        given = self.shock_after is not None
-        if given and (any(y - x < self.shock_seconds for x, y in pairwise(self.shocks)) or not self.shocks):
+        explicit = self.shock_after is not None
+        if explicit and (any(y - x < self.shock_seconds for x, y in pairwise(self.shocks)) or not self.shocks):
             raise ValueError(
                 f"shock_after = {shown(self.shock_after)} must be a time, or several, each at least shock_seconds = "
                 f"{self.shock_seconds:g} s after the one before, such as [60, 120]."
             )
-        if (self.shock and given) or self.shock_vehicle is not None:
+        if (self.shock and explicit) or self.shock_vehicle is not None:
             self._check_shocked()
         only_with(self, "flow", ("tailgating", "fuel"))
 
@@ -256,7 +256,7 @@ class RingTask(Task):
 
 
 def even(step: Transition) -> Tensor:
-    """Return ``⟨min(v/v*, 1)⟩`` over all vehicles, ``(…, 1)``, ``v* = (mean gap − 2 m)/1 s``: 1 where waves are gone."""
+    """Return ``⟨min(v/v*, 1)⟩`` over all vehicles, ``(…, 1)``, ``v* = (mean gap − 2 m)/1 s``: 1 without waves."""
     state = step.after.state
     best = (state.gap.mean(-1, keepdim=True) - 2.0).clamp_min(0.5)
     return (state.speed / best).clamp_max(1.0).mean(-1, keepdim=True)
