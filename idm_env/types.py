@@ -15,7 +15,9 @@ Nobody there
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
@@ -23,6 +25,8 @@ from torch import Tensor
 
 Tree = TypeVar("Tree")
 """A tensor, None, or a tuple or mapping of trees."""
+
+_RECORDED: ContextVar[bool] = ContextVar("recorded", default=False)
 
 FAR = 1e4
 """Gap to a neighbour that is not there (m): finite, so that nothing downstream meets an infinity."""
@@ -354,3 +358,21 @@ def mapped(function: Callable[..., Tensor], first: Tree, *rest: Any) -> Tree:
         return first
     parts = (mapped(function, *each) for each in zip(first, *rest, strict=True))
     return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)  # type: ignore[return-value]
+
+
+@contextmanager
+def recording() -> Iterator[None]:
+    """Have it known that what is done inside is recorded: for any values, not for these."""
+    before = _RECORDED.set(True)
+    try:
+        yield
+    finally:
+        _RECORDED.reset(before)
+
+
+def worthwhile(mask: Tensor) -> bool:
+    """Return whether any is true, so that what holds only there need not be done where nobody is.
+
+    True, and nothing is asked, where the answer would be waited for (a GPU) or is not one for all values (a recording).
+    """
+    return mask.device.type != "cpu" or _RECORDED.get() or torch.compiler.is_compiling() or bool(mask.any())

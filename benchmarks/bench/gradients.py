@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import torch
 
-import idm_env.envs.batch
 from benchmarks.bench import jax_ring
 from benchmarks.bench.measure import Case, measure
 from idm_env import Effect, Parameter
@@ -67,14 +66,12 @@ def of(keywords: Mapping[str, Any], count: int, steps: int, window: bool) -> dic
 
 def rows(rounds: int) -> list[dict[str, Any]]:
     """Return least and median milliseconds of CPU time a step of every workload, interleaved within each."""
-    threads, eager = torch.get_num_threads(), idm_env.envs.batch.EAGER_STEPS
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    idm_env.envs.batch.EAGER_STEPS = 0
     try:
         result = [row for what, cases in workloads() for row in _told(what, measure(cases(), rounds))]
     finally:
         torch.set_num_threads(threads)
-        idm_env.envs.batch.EAGER_STEPS = eager
     return result
 
 

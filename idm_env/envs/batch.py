@@ -28,7 +28,7 @@ from idm_env.kernels import dispatch
 from idm_env.scalar.record import Unordered, Untraceable
 from idm_env.tasks import Draw, EnvState
 from idm_env.tasks.open_lanes import OpenLanesTask
-from idm_env.types import Params, State, mapped
+from idm_env.types import Params, State, mapped, worthwhile
 from idm_env.validation import whole
 
 if TYPE_CHECKING:
@@ -74,6 +74,11 @@ class Outcome(NamedTuple):
         return cls(told["observation"], told["reward"], told["terminated"], told["truncated"], whole, rest)
 
 
+def _some(mask: Any) -> bool:
+    """Return whether any is true, of an array or a tensor (``types.worthwhile``)."""
+    return worthwhile(mask) if isinstance(mask, Tensor) else bool(mask.any())
+
+
 def _held(before: Outcome, after: Outcome, over: Any) -> Outcome:
     """Return what two steps under one action give: sums of rewards, the rest of the second; where over of the first."""
 
@@ -86,15 +91,12 @@ def _held(before: Outcome, after: Outcome, over: Any) -> Outcome:
     if "rewards" in after.details:
         parts = before.details["rewards"] + after.details["rewards"]
         total = total._replace(details={**after.details, "rewards": parts})
-    if not bool(over.any()):
+    if not _some(over):
         return total
     details = {name: kept(x, total.details[name]) for name, x in before.details.items()}
     seen, reward, ended, cut = map(kept, before[:4], total[:4])
     return Outcome(seen, reward, ended, cut, Whole(*map(kept, before.whole, total.whole)), details)
 
-
-EAGER_STEPS = 2_000
-"""Steps on several lanes that torch does before they are compiled, which takes as long as these."""
 
 _DETAILS = tuple((name, f"info_{name}") for name in INFO)
 
@@ -113,13 +115,13 @@ class Batch:
         self._world: EnvState | None = None
         self._moves = Moves(settings)
         self._values = self._compiled()
-        self._several, self._on_lanes = self.task.road.outline is not None, 0
+        self._several = self.task.road.outline is not None
         self._loaded = False
         self._seen: Any = None
         self._reasons: dict[int, str] = {}
         self.counters: Counters | None = None
         if isinstance(settings.task, OpenLanesTask) and (settings.task.loops or "stops" in settings.info):
-            self.counters = Counters(settings.task, count)
+            self.counters = Counters(settings.task, count, settings.device)
         self._draw: Draw | None = None
         self._driven: Params | None = None
         self._pool: EnvState | None = None
@@ -343,14 +345,14 @@ class Batch:
         outcome = self._once(action, live, held == 1)
         for left in reversed(range(held - 1)):
             over = outcome.whole.terminated | outcome.whole.truncated
-            if bool(over.all()):
+            if not _some(~over):
                 break
-            outcome = _held(outcome, self._once(action, live, not left or bool(over.any())), over)
+            outcome = _held(outcome, self._once(action, live, not left or _some(over)), over)
         if self.counters is None or "stops" not in self.settings.info:
             return outcome
         self.counters.decided(self.glance().state)
-        stops: Any = np.repeat(self.counters.stops[:, None], len(self.task.agents), 1)
-        stops = torch.as_tensor(stops, device=self.settings.device) if self.settings.output == "torch" else stops
+        stops: Any = self.counters.stops.unsqueeze(-1).repeat(1, len(self.task.agents))
+        stops = stops if self.settings.output == "torch" else stops.cpu().numpy()
         return outcome._replace(details={**outcome.details, "stops": stops})
 
     def crash_reason(self, row: int, agent: int | None = None) -> str:
@@ -362,16 +364,14 @@ class Batch:
         outcome = self._stepped(action, live, observed)
         if self.counters is not None and self.counters.loops:
             self.counters.after(self.glance().state)
-        if self.task.held > 1 and self.count > 1 and "crash" in outcome.details:
-            crashed = outcome.terminated.any(-1)
-            for row in np.flatnonzero(crashed.cpu().numpy() if isinstance(crashed, Tensor) else crashed).tolist():
+        reasons = self.task.held > 1 and self.count > 1 and "crash" in outcome.details
+        if reasons and self.settings.device.type == "cpu":  # elsewhere it is told from the worlds where the action ends
+            for row in np.flatnonzero(np.asarray(outcome.terminated.any(-1))).tolist():
                 self._reasons[row] = self.crash_reason(row)
         return outcome
 
     def _stepped(self, action: Tensor | np.ndarray | None, live: Tensor | None, observed: bool) -> Outcome:
-        self._on_lanes += self._several
-        eager = self.task.simulator.untried or 0 < self._on_lanes <= EAGER_STEPS
-        if self._values is not None and not eager:
+        if self._values is not None and not self.task.simulator.untried:
             outputs = self._step_values(action, live)
             if outputs is not None:
                 return Outcome.of(outputs)

@@ -11,6 +11,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from idm_env.tasks.open_lanes import OpenLanesTask
@@ -18,73 +19,65 @@ from idm_env.tasks.said_roads import STANDS
 from idm_env.types import State
 
 
-def _array(x: Tensor) -> np.ndarray:
-    return x.detach().cpu().numpy().copy()
-
-
 class _Seen(NamedTuple):
-    """A state as arrays: steps ``(rows,)``, of vehicles ``(rows, n)``; ``trip`` tells the journeys of a slot apart."""
+    """Vehicles ``(rows, n)`` as they were, on their device; ``trip`` tells the journeys of a slot apart."""
 
-    step: np.ndarray
-    speed: np.ndarray
-    present: np.ndarray
-    trip: np.ndarray
-    position: np.ndarray
-    lane: np.ndarray
+    speed: Tensor
+    present: Tensor
+    trip: Tensor
 
     @classmethod
-    def of(cls, state: State, places: bool) -> _Seen:
+    def of(cls, state: State) -> _Seen:
         assert state.present is not None and state.lanes is not None and state.lanes.trips is not None
-        motion = _array(state.speed), _array(state.present) > 0, _array(state.lanes.trips.left)
-        where = (_array(state.position), _array(state.lanes.lane)) if places else (motion[0], motion[0])
-        return cls(_array(state.step), *motion, *where)
+        return cls(state.speed.detach().clone(), state.present > 0, state.lanes.trips.left.clone())
 
-    def same(self, later: _Seen) -> np.ndarray:
+    def same(self, later: _Seen) -> Tensor:
         """Return which vehicles are there on the same trip later."""
-        both: np.ndarray = self.present & later.present & (self.trip == later.trip)
-        return both
+        return self.present & later.present & (self.trip == later.trip)
 
 
 class Counters:
     """Stops ``(rows,)``, and a table for each row, of this episode."""
 
-    def __init__(self, task: OpenLanesTask, rows: int) -> None:
+    def __init__(self, task: OpenLanesTask, rows: int, device: torch.device) -> None:
         self.loops, self._dt = task.loops, task.simulator.dt
-        self.stops = np.zeros(rows, dtype=np.int64)
+        self.stops = torch.zeros(rows, dtype=torch.int64, device=device)
         self.tables: list[list[dict[str, Any]]] = [[] for _ in range(rows)]
         self._sums = np.zeros((rows, len(self.loops), 3))
         self._decided: _Seen | None = None
-        self._last: _Seen | None = None
+        self._last: tuple[_Seen, Tensor, Tensor] | None = None
 
     def begin(self, rows: np.ndarray, state: State) -> None:
         """Forget what was counted in some rows (indices), whose episodes begin."""
-        self.stops[rows], self._sums[rows] = 0, 0.0
+        begun = torch.as_tensor(rows, device=self.stops.device)
+        self.stops, self._sums[rows] = self.stops.index_fill(0, begun, 0), 0.0
         for row in rows:
             self.tables[row] = []
-        self._last = self._decided = _Seen.of(state, bool(self.loops))
+        self._decided = _Seen.of(state)
+        self._last = self._decided, state.step.clone(), state.position.detach().clone()
 
     def decided(self, state: State) -> None:
         """Count who has come to stand since the decision before, or the beginning."""
-        last, now = self._decided, _Seen.of(state, places=False)
+        last, now = self._decided, _Seen.of(state)
         self._decided = now
         assert last is not None
-        self.stops += (last.same(now) & (last.speed >= STANDS) & (now.speed < STANDS)).sum(-1)
+        self.stops = self.stops + (last.same(now) & (last.speed >= STANDS) & (now.speed < STANDS)).sum(-1)
 
     def after(self, state: State) -> None:
         """Count who has passed a detector in the step that has led here."""
-        last, now = self._last, _Seen.of(state, places=True)
-        self._last = now
-        assert last is not None
-        follows = now.step == last.step + 1
-        same, rear = last.same(now) & follows[:, None], now.position - _array(state.length)
+        now, step, position = _Seen.of(state), state.step.clone(), state.position.detach().clone()
+        assert self._last is not None and state.lanes is not None
+        (last, step_then, then), self._last = self._last, (now, step, position)
+        follows, rear = step == step_then + 1, position - state.length
+        same = last.same(now) & follows.unsqueeze(-1)
         for i, loop in enumerate(self.loops):
-            on = now.present & (now.lane == loop.lane) & (now.position >= loop.place)
-            passed = same & on & (last.position < loop.place)
+            on = now.present & (state.lanes.lane == loop.lane) & (position >= loop.place)
+            passed = same & on & (then < loop.place)
             counts = passed.sum(-1), (passed * now.speed).sum(-1), (on & (rear < loop.place)).any(-1)
-            self._sums[:, i] += follows[:, None] * np.stack(counts, -1)
+            self._sums[:, i] += (follows.unsqueeze(-1) * torch.stack([x.double() for x in counts], -1)).cpu().numpy()
             steps = round(loop.every / self._dt)
-            for row in np.flatnonzero(follows & (now.step % steps == 0)).tolist():
-                self._close(row, i, int(now.step[row]) - steps, steps)
+            for row in torch.nonzero(follows & (step % steps == 0)).squeeze(-1).tolist():
+                self._close(row, i, int(step[row]) - steps, steps)
 
     def _close(self, row: int, i: int, first: int, steps: int) -> None:
         """Write the line of an interval that is over."""

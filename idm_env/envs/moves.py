@@ -14,7 +14,7 @@ from torch import Tensor
 
 from idm_env.envs.settings import Settings
 from idm_env.tasks import EnvState
-from idm_env.types import Params
+from idm_env.types import Params, worthwhile
 
 
 class Moves:
@@ -85,7 +85,7 @@ class Moves:
             ends, cut = terminated[..., 0], truncated[..., 0]
         else:
             ends, cut = terminated.any(-1), (truncated | terminated).all(-1) & truncated.any(-1)
-        reads = observed or bool((ends | cut).any())
+        reads = observed or worthwhile(ends | cut)
         return {
             "observation": task.observe(after) if reads else reward.new_empty(0),
             "reward": reward,

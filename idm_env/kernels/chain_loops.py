@@ -13,7 +13,7 @@ import numpy as np
 from idm_env.extras import needed
 from idm_env.kernels.compiler import apart
 from idm_env.kernels.memory import located
-from idm_env.kernels.order_loops import lay, walk
+from idm_env.kernels.order_loops import lay, sort, walk
 from idm_env.kernels.phases import call_rows
 from idm_env.kernels.tiles import exact
 from idm_env.kernels.world_loop import advance, cut, retreat
@@ -119,7 +119,7 @@ def put_in_lanes(low, high, said, before, links, position, was, present, coming,
     ``links`` are written from those ``before``; ``fresh`` gets whose leader is another one; ``was`` is who was present.
     """
     lane, leader, follower, changed = links[0], links[1], links[2], links[3]
-    key = np.empty(n)
+    key, order, spare = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
     for row in range(low, high):
         base = row * n
         last, width = position[base], 0.0
@@ -137,7 +137,7 @@ def put_in_lanes(low, high, said, before, links, position, was, present, coming,
             )
             key[i] = (lane[slot] if on_road else count) * width + (np.float64(position[slot]) - np.float64(last))
             leader[slot] = follower[slot] = i
-        order = np.argsort(key, kind="mergesort")
+        sort(key, order, spare, n)
         for r in range(n - 1):
             i, j = base + order[r], base + order[r + 1]
             if lane[i] == lane[j] and (not coming or (present[i] > 0 and present[j] > 0)):
@@ -160,7 +160,10 @@ def step_chains(
     """
     low, high, first, last = cut(extent, begin, end)
     wide = extent[2]
-    to_places(np.arange(low, high), sources, source_strides, truths, targets, slots, wide, k)
+    rows = np.empty(high - low, np.int64)
+    for i in range(low, high):
+        rows[i - low] = i
+    to_places(rows, sources, source_strides, truths, targets, slots, wide, k)
     advance(
         places, strides, w, h, past, newest, measures, phases, looks, recalls, read, k, extent, t, kept, first, last
     )  # fmt: skip

@@ -301,7 +301,8 @@ def decide(
     and ``begins`` (rows · (count + 1)) get the order of every row afterwards, as ``walk`` would put it. Returns False,
     with some rows decided, where links are not the order of positions, or a wish is NaN.
     """
-    lane, leader, follower, changed, refused, blocked, unjudged = links
+    lane, leader, follower = links[0], links[1], links[2]
+    changed, refused, blocked, unjudged = links[3], links[4], links[5], links[6]
     w, which = workspace((slots + RESULTS) * ROW, k), np.empty(len(places) * CHUNK, np.int64)
     order, begin, place = np.empty(n, np.int64), np.empty(count + 1, np.int64), np.empty(n)
     fresh_order, fresh_begin = np.empty(n, np.int64), np.empty(count + 1, np.int64)

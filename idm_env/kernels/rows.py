@@ -23,6 +23,7 @@ from idm_env.kernels.memory import addresses
 from idm_env.kernels.row_text import BINARY, COMPARE, REDUCE, UNARY, body, fused, loops
 from idm_env.scalar import library
 from idm_env.scalar.record import Untraceable
+from idm_env.types import recording
 
 _TEXT = {"f": "F", "d": "np.float64", "i": "np.int64", "b": "np.bool_"}
 KINDS = {torch.float32: "f", torch.float64: "f", torch.int64: "i", torch.bool: "b"}
@@ -117,7 +118,7 @@ class RowFunction:
         self._tables: list[np.ndarray] = []
         self._table_of: dict[int, str] = {}
         self._parts: list[list[str]] = []
-        with torch.no_grad(), _Recorder(self.simpler) as recorder:
+        with torch.no_grad(), recording(), _Recorder(self.simpler) as recorder:
             results = dict(function(**inputs))
         self._floats = next(x.dtype for x in (*inputs.values(), *results.values()) if x.is_floating_point())
         for name, x in inputs.items():

@@ -64,10 +64,11 @@ def advance(
         cell = row * size + first + skip
         if size <= wide:
             # Whole rows find their past where it lies: it is a hundred times as long as a state.
-            step(w, all_past + cell * k.itemsize, count, n, size, measures, phases, looks, recalls, k, newest + 1)
+            source = np.int64(all_past + cell * k.itemsize)
+            step(w, source, count, n, size, measures, phases, looks, recalls, k, newest + 1)
         else:
             piece_of_past(h, all_past, newest, slots, signals, strides, row, first, n, size, count)
-            step(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, slots)
+            step(w, np.int64(h.ctypes.data), ROW, n, size, measures, phases, looks, recalls, k, slots)
             for i in range(signals):
                 copy(all_past, ((newest + 1) * signals + i) * count + cell, h, (slots * signals + i) * ROW + skip, own)
         for i in range(states):

@@ -9,7 +9,7 @@ Shapes: what belongs to slots is ``[..., n]``; times in s, positions in m.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from idm_env.roads import Road
 from idm_env.roads.linked import standing, still_changing, without_absent
 from idm_env.step import CarFollowingStep
-from idm_env.types import ENTRY_SPEED, FAR, Moving, Params, State, Trips
+from idm_env.types import ENTRY_SPEED, FAR, Moving, Params, State, Trips, worthwhile
 
 
 class Counts(NamedTuple):
@@ -129,20 +129,14 @@ def turnover(stepping: CarFollowingStep, state: State, params: Params) -> State:
     This, too, is done when lanes are decided about: until then whoever is beyond the end drives on, and is followed.
     """
     now = state.clock.remainder(stepping.decides_after) == 0
-    return turned(stepping, state, params, now, bool) if bool(now.any()) else state
+    return turned(stepping, state, params, now) if worthwhile(now) else state
 
 
-def turned(
-    stepping: CarFollowingStep,
-    state: State,
-    params: Params,
-    now: Tensor,
-    sure: Callable[[Tensor], bool] = lambda _: True,
-) -> State:
-    """Return the state after that, in all rows where it is ``now``; a recording does not ask whether anybody waits."""
+def turned(stepping: CarFollowingStep, state: State, params: Params, now: Tensor) -> State:
+    """Return the state after that, in all rows where it is ``now``."""
     if stepping.road.leaving:
         state = _departed(stepping, state, now)
-    return _entered(stepping, state, params, now, sure)
+    return _entered(stepping, state, params, now)
 
 
 def _departed(stepping: CarFollowingStep, state: State, now: Tensor) -> State:
@@ -158,9 +152,7 @@ def _departed(stepping: CarFollowingStep, state: State, now: Tensor) -> State:
     return state._replace(present=stay, gap=torch.where(followed, state.gap, FAR), lanes=lanes)
 
 
-def _entered(
-    stepping: CarFollowingStep, state: State, params: Params, now: Tensor, sure: Callable[[Tensor], bool]
-) -> State:  # fmt: skip
+def _entered(stepping: CarFollowingStep, state: State, params: Params, now: Tensor) -> State:
     """Return the state after those have entered for whom it is time and who have room, one on each lane.
 
     Of a lane's queue the first enters at the beginning of the lane, where the gap s to the last vehicle there allows::
@@ -175,7 +167,7 @@ def _entered(
     if schedule is None:
         return state
     waits = (state.present <= 0) & (due(schedule, stepping.time(state)) > schedule.entered) & now
-    if not sure(waits.any()):
+    if not worthwhile(waits):
         return state
     begins = _begins(stepping.road, state.speed)
     lanes = torch.arange(len(begins), device=begins.device)

@@ -16,7 +16,7 @@ from idm_env.roads.ends import either
 from idm_env.roads.layout import LaneLayout
 from idm_env.roads.merging import on_lanes
 from idm_env.roads.order import Order, laps
-from idm_env.types import FAR, LaneState, Moving, Neighbour, State
+from idm_env.types import FAR, LaneState, Moving, Neighbour, State, worthwhile
 
 
 class Claim(NamedTuple):
@@ -230,15 +230,19 @@ class Linked(Sideways):
             ))  # fmt: skip
         return lanes[0], lanes[1]
 
-    def on_the_way(self, before: State, after: State, claim: Claim, steps: int) -> State:
-        """Return the state after a decision in which those who were granted a change take some steps for it."""
+    def on_the_way(self, before: State, after: State, claim: Claim, steps: int, turn: Tensor) -> State:
+        """Return the state after a decision in which those who were granted a change take some steps for it.
+
+        ``turn`` (bool, ``(…, 1)``) are the rows that decide.
+        """
         assert before.lanes is not None and after.lanes is not None
         moving = before.lanes.moving or standing(before)
         until = torch.where(claim.granted, before.clock + steps, moving.until)
         moving = Moving(torch.where(claim.granted, before.lanes.lane, moving.origin), until, moving.shadow)
         lanes = after.lanes
         around = self._leaving(after._replace(lanes=lanes._replace(moving=moving))).around(lanes.lane, after.position)
-        return after._replace(lanes=lanes._replace(moving=moving._replace(shadow=around.leader)))
+        shadow = torch.where(turn, around.leader, moving.shadow)
+        return after._replace(lanes=lanes._replace(moving=moving._replace(shadow=shadow)))
 
     # -- changes -------------------------------------------------------------------------------------------------
 
@@ -329,10 +333,13 @@ class Linked(Sideways):
             refused=links.refused + claim.refused,
             blocked=links.blocked + claim.blocked,
         )
-        if not bool(claim.granted.any()):
+        if not worthwhile(claim.granted):
             return state._replace(lanes=links)
         order = Order.of(self.position, claim.lane, state.present, self.road.count, self.road.ring)
-        leader, follower = order.links()
+        # Where nobody changes lanes links stay what they are.
+        some = claim.granted.any(-1, keepdim=True)
+        before = self.links_now.leader, self.links_now.follower
+        leader, follower = (torch.where(some, new, old) for new, old in zip(order.links(), before, strict=True))
         other = claim.granted & claim.judged & (follower != claim.follower)
         links = links._replace(lane=claim.lane, leader=leader, follower=follower, unjudged=links.unjudged + other)
         fresh = Linked(self.road, links, self.position).gaps(self.position, state.length)
@@ -341,9 +348,6 @@ class Linked(Sideways):
 
 def _most(room: tuple[int, ...], key: Tensor, value: Tensor, how: Literal["amax", "amin"]) -> Tensor:
     """Return, for every vehicle, the largest or smallest value among those of its key."""
-    worst = torch.zeros((), dtype=value.dtype, device=value.device)
-    if how == "amin":
-        worst = worst + value.max()
-    elif value.is_floating_point():
-        worst = worst + value.min()
-    return worst.expand(room).clone().scatter_reduce(-1, key, value, how).gather(-1, key)
+    ends = (torch.finfo if value.is_floating_point() else torch.iinfo)(value.dtype)
+    worst = value.new_full(room, ends.max if how == "amin" else ends.min)
+    return worst.scatter_reduce(-1, key, value, how).gather(-1, key)

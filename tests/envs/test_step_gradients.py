@@ -19,12 +19,6 @@ from idm_env.tasks import FEATURES, REWARD_TERMS, TASKS
 pytest.importorskip("numba")
 
 
-@pytest.fixture(autouse=True)
-def compiled_at_once(monkeypatch):
-    """Several lanes are compiled at the first step, not after many."""
-    monkeypatch.setattr("idm_env.envs.batch.EAGER_STEPS", 0)
-
-
 DECLARED = {"features": list(FEATURES), "vehicles": 2}
 WEIGHTS = dict.fromkeys(REWARD_TERMS, 0.1)
 CASES = {

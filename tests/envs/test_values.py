@@ -20,12 +20,6 @@ from tests.envs.test_step_gradients import DECLARED, WEIGHTS
 pytest.importorskip("numba")
 
 
-@pytest.fixture(autouse=True)
-def compiled_at_once(monkeypatch):
-    """Several lanes are compiled at the first step, not after many."""
-    monkeypatch.setattr("idm_env.envs.batch.EAGER_STEPS", 0)
-
-
 CASES = [
     ("ring", {"start": "wave", "warmup": 20}),
     (
@@ -210,18 +204,17 @@ def test_a_function_that_mixes_rows_or_is_not_known_is_refused(function):
         RowFunction(function, {"x": torch.rand(101, 4)}, 101)
 
 
-def test_several_lanes_are_compiled_after_many_steps(monkeypatch):
-    """Before, and where it would not pay, torch steps them; a copy counts on."""
-    monkeypatch.setattr("idm_env.envs.batch.EAGER_STEPS", 5)
+def test_several_lanes_are_compiled_from_the_first_step():
+    """So is what a copy of an environment does."""
     task, keywords = LANES["highway"]
     ours, theirs = (gym.make("DiffIDM-v0", task=task, dtype="float64", **keywords) for _ in range(2))
     theirs.unwrapped.batch._values = None
     for env in (ours, theirs):
         env.reset(seed=2)
     action = np.full(ours.action_space.shape, 0.3)
-    for step in range(12):
+    for step in range(6):
         if step == 3:
             ours = copy.deepcopy(ours)
         for told in zip(ours.step(action)[:4], theirs.step(action)[:4], strict=True):
             _same(*told)
-        assert ours.unwrapped.batch._loaded == (step >= 5)
+        assert ours.unwrapped.batch._loaded
