@@ -111,7 +111,7 @@ def spacing_error(gap: Tensor, batch: Batch) -> Tensor:
 
 def judge(policy: Policy, items: Sequence[Episode], task: Task) -> dict[str, float]:
     """Return the errors of a policy on episodes, as ``idm_env.fitting.evaluate`` has them."""
-    batch = Batch.of(items, dtype=torch.float32, substeps=1)
+    batch = Batch.stack(items, dtype=torch.float32, substeps=1)
     with torch.no_grad():
         gap, speed = simulate(policy, batch, task)
     weight = batch.valid[1:]
@@ -153,7 +153,7 @@ def samples(batch: Batch) -> tuple[Tensor, Tensor]:
 
 def cloned(a: Arguments, training: Sequence[Episode]) -> Policy:
     """Return the policy of behaviour cloning."""
-    seen, accel = samples(Batch.of(training, dtype=torch.float32, substeps=1))
+    seen, accel = samples(Batch.stack(training, dtype=torch.float32, substeps=1))
     policy = Policy(len(SCALES), a.hidden)
     policy.mean.copy_(seen.mean(0))
     policy.scale.copy_(seen.std(0))
@@ -177,7 +177,7 @@ def train(a: Arguments) -> list[dict[str, Any]]:
         saved = content["training"]
         optimiser.load_state_dict(saved["optimiser"])
         first, before = saved["update"] + 1, saved["cpu_seconds"]
-    batch = Batch.of(windows(training, a.window), dtype=torch.float32, substeps=1)
+    batch = Batch.stack(windows(training, a.window), dtype=torch.float32, substeps=1)
     began, spent = time.process_time() - before, before
     with closing(make_logger(a, first)) as logger, tqdm(range(first, a.updates), "imitation", disable=None) as bar:
         for update in bar:

@@ -120,7 +120,7 @@ def scored(part: Part, on_progress: OnProgress = silent) -> dict[str, Any]:
         "sigma": sigma, "memory_time": memory_time, "one_of": None, "gain": {},
     }  # fmt: skip
     if only_hidden:
-        batch, raw = (Batch.of(x, substeps=1) for x in (smooth, measured))
+        batch, raw = (Batch.stack(x, substeps=1) for x in (smooth, measured))
         estimates = estimate(behind_a_record(batch.dt, drift), batch, IDM_NAMES, usual(IDM_NAMES), measured=raw)
     else:
         drift_of_set = tell(smooth, measured, DRIFTS)

@@ -37,7 +37,7 @@ def judge(items: Episodes, found: Fit) -> dict[str, float]:
 
 def published(items: Episodes) -> dict[str, float]:
     """Return the errors of the published parameters."""
-    batch = Batch.of(items, substeps=1)
+    batch = Batch.stack(items, substeps=1)
     group, names = group_of(batch.episodes, "all")
     simulator = Simulator(Lane(), (IDM(), Replay(), Brakes()), dt=batch.step)
     problem = Problem(simulator, batch, IDM_NAMES, (), group, names)

@@ -23,8 +23,8 @@ from idm_env.jobs.progress import OnProgress, silent
 from idm_env.jobs.workers import HERE, Workers
 from idm_env.prediction.files import OURS, case_of
 from idm_env.prediction.metrics import Score, score, summary
-from idm_env.prediction.mixture import SHARES, Seen, Shares, fit_shares, seen
-from idm_env.prediction.predict import METHODS, Mixture, Prediction, chosen, mixture
+from idm_env.prediction.mixture import SHARES, Seen, Shares, fit_shares, score_hits
+from idm_env.prediction.predict import METHODS, Mixture, Prediction, choose_futures, mixture
 from idm_env.prediction.scene import MapScene
 
 STRAIGHT = "constant velocity"
@@ -57,8 +57,8 @@ def known_agents(scenario: Scenario, _: OnProgress = silent) -> list[Known]:
         is_valid = agent.valid[scenario.present] and agent.valid[scenario.present + 10 * LEAST_S]
         if is_valid:
             one = mixture(scene, index)
-            case = case_of(scenario, chosen(scene, one))
-            hit = seen(case, one.futures, one.weights)
+            case = case_of(scenario, choose_futures(scene, one))
+            hit = score_hits(case, one.futures, one.weights)
             assert hit is not None
             agents.append(Known(scene, one, hit))
     return agents
@@ -89,7 +89,7 @@ def compared(agents: Iterable[tuple[Known, Shares]], methods: Sequence[str]) -> 
     """Return scores by method; ours with the shares that are held out."""
     pairs = list(agents)
     single: dict[str, Callable[[MapScene, int], Prediction]] = {n: m for n, m in METHODS.items() if n in methods}
-    return {OURS: [one.scored(chosen(one.scene, one.mixture, shares)) for one, shares in pairs]} | {
+    return {OURS: [one.scored(choose_futures(one.scene, one.mixture, shares)) for one, shares in pairs]} | {
         name: [one.scored(method(one.scene, one.mixture.agent)) for one, _ in pairs] for name, method in single.items()
     }
 

@@ -225,7 +225,7 @@ def estimate(
         np.array(noise or (0.1, 0.1)), 0.02, np.broadcast_to(np.asarray(spread, float), len(free)).copy(),
     )  # fmt: skip
     limits = _limits(drivers, noise)
-    path = Path.at(drivers, np.broadcast_to(np.clip(theta, *drivers.bounds), (len(batch), len(free))).copy())
+    path = Path.without_drift(drivers, np.broadcast_to(np.clip(theta, *drivers.bounds), (len(batch), len(free))).copy())
     for _ in range(SETTLED):
         path = _path(Likelihood(drivers, path), settings)
     for number in range(rounds):

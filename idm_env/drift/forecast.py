@@ -23,14 +23,14 @@ def followed(
 
     Steps are linear about the record and about the levels that the pass before had found one sample earlier.
     """
-    path = Path.at(drivers, theta)
+    path = Path.without_drift(drivers, theta)
     for _ in range(passes):
         mean, covariance, _ = Likelihood(drivers, path).filtered(settings)
         path = predicted(path, settings, drivers.batch.dt, mean, covariance)
     return mean[..., 2:], covariance[..., 2:, 2:]
 
 
-def drawn(
+def draw_gaps(
     drivers: MeasuredDrivers,
     settings: DriftSettings,
     theta: np.ndarray,
@@ -59,7 +59,7 @@ def _chunk(
     starts: list[tuple[int, int]], steps: int, count: int, seed: int,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     simulator, d = drivers.simulator, drivers.driver
-    batch = Batch.of([drivers.batch.episodes[r].part(t, t + steps + 1) for r, t in starts], substeps=1)
+    batch = Batch.stack([drivers.batch.episodes[r].part(t, t + steps + 1) for r, t in starts], substeps=1)
     random = np.random.default_rng(seed)
     rows, samples = np.array([r for r, _ in starts]), np.array([t for _, t in starts])
     values, vectors = np.linalg.eigh(levels[1][samples, rows])
@@ -118,4 +118,4 @@ def covers(drawn: np.ndarray, truth: np.ndarray, share: float) -> tuple[np.ndarr
     return (truth >= low) & (truth <= high), high - low
 
 
-__all__ = ["covers", "crps", "drawn", "followed", "log_score"]
+__all__ = ["covers", "crps", "draw_gaps", "followed", "log_score"]

@@ -48,7 +48,7 @@ def scores(
     ``model``, ``ahead_s``, ``forecasts``, ``gap_rmse_m`` of the mean, ``gap_crps_m`` (Gneiting, Raftery 2007) and how
     many percent of true gaps the central 50 and 90 % of the draws hold.
     """
-    batch, raw = (Batch.of(x, substeps=1) for x in (smooth, measured))
+    batch, raw = (Batch.stack(x, substeps=1) for x in (smooth, measured))
     dt, longest = smooth[0].dt, HORIZONS_S[-1]
     begins = [np.arange(FIRST_S, (len(e) - 1) * dt - longest, EVERY_S) for e in smooth]
     starts = [(r, round(t / dt)) for r, times in enumerate(begins) for t in times]
@@ -57,7 +57,7 @@ def scores(
         drivers = MeasuredDrivers(estimate.drivers.simulator, batch, raw, IDM_NAMES)
         theta = np.broadcast_to(np.median(estimate.theta, 0), (len(smooth), len(IDM_NAMES))).copy()
         levels = forecast.followed(drivers, estimate.settings, theta)
-        gap, _ = forecast.drawn(drivers, estimate.settings, theta, levels, starts, longest, DRAWS, seed)
+        gap, _ = forecast.draw_gaps(drivers, estimate.settings, theta, levels, starts, longest, DRAWS, seed)
         for ahead in HORIZONS_S:
             steps = round(ahead / dt)
             truth = np.array([measured[r].gap_m[t + steps] for r, t in starts])

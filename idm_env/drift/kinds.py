@@ -102,7 +102,7 @@ def tell(
         executor: Whoever estimates the sorts, a part each.
         on_progress: Called with the name, done, total and the log-likelihood.
     """
-    batch, raw = (Batch.of(x, substeps=1) for x in (smooth, measured))
+    batch, raw = (Batch.stack(x, substeps=1) for x in (smooth, measured))
     sorts = [_Sort(kind, batch, raw, noise) for kind in (None, *kinds)]
     stored = {} if store is None else {s: x for s in sorts if (x := store.get(str(s))) is not None}
     missing = [s for s in sorts if s not in stored]

@@ -40,7 +40,7 @@ class Path:
     unsure: np.ndarray
 
     @classmethod
-    def at(cls, drivers: MeasuredDrivers, theta: np.ndarray) -> Path:
+    def without_drift(cls, drivers: MeasuredDrivers, theta: np.ndarray) -> Path:
         """Return the path of drivers on their records who do not drift, known for sure."""
         gap, speed = drivers.batch.gap.numpy(), drivers.batch.speed.numpy()
         k = len(drivers.drifts)

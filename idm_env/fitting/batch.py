@@ -51,7 +51,9 @@ class Batch:
     substeps: int = 1
 
     @classmethod
-    def of(cls, episodes: Iterable[Episode], dtype: torch.dtype = torch.float64, substeps: int | None = None) -> Batch:
+    def stack(
+        cls, episodes: Iterable[Episode], dtype: torch.dtype = torch.float64, substeps: int | None = None
+    ) -> Batch:
         """Stack episodes. DataError if there is none, or if they differ in their time step.
 
         ``substeps`` None takes as many as ``INTEGRATION_STEP_S`` asks for.
@@ -75,12 +77,16 @@ class Batch:
             speed=speed[..., driver].contiguous(),
             valid=torch.as_tensor(np.arange(steps)[:, None] < samples.lengths, dtype=dtype),
             position=_between_positions(position, speed, samples.dt, fine),
-            all_speed=_between(speed, fine),
-            accel=_between(rows(samples.accel), fine),
+            all_speed=_interpolate(speed, fine),
+            accel=_interpolate(rows(samples.accel), fine),
             present=_held(rows(samples.present), fine),
             length=torch.as_tensor(samples.length, dtype=dtype),
             first_step=torch.as_tensor(np.round(samples.time[begin] / samples.dt * fine).astype(int)),
-            beside=(_between(adjacent[..., 0], fine), _between(adjacent[..., 1], fine), _held(adjacent[..., 2], fine)),
+            beside=(
+                _interpolate(adjacent[..., 0], fine),
+                _interpolate(adjacent[..., 1], fine),
+                _held(adjacent[..., 2], fine),
+            ),
             substeps=fine,
         )
 
@@ -170,7 +176,7 @@ class Batch:
         return simulator.drawn(position[0], inputs, len(position), seed)
 
 
-def _between(x: Tensor, substeps: int) -> Tensor:
+def _interpolate(x: Tensor, substeps: int) -> Tensor:
     """Interpolate linearly between samples, time first."""
     share = torch.arange(substeps, dtype=x.dtype) / substeps
     share = share.reshape(1, -1, *(1,) * (x.dim() - 1))

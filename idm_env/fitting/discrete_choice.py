@@ -295,9 +295,9 @@ def held_out(fitted: Sequence[Chosen], decisions: Decisions, fold: Tensor) -> li
         probabilities = torch.zeros(len(decisions), 3, dtype=torch.float64)
         for k in range(int(fold.max()) + 1):
             mine = fold[decisions.vehicle] == k
-            others = fit_choice(model, decisions.of(~mine), starts=[all_drivers.theta.tolist()], errors=False)
+            others = fit_choice(model, decisions.select(~mine), starts=[all_drivers.theta.tolist()], errors=False)
             with torch.no_grad():
-                seen = decisions.of(mine)
+                seen = decisions.select(mine)
                 scores[mine] = model.each(others.theta, seen)
                 probabilities[mine] = model.log_probabilities(others.theta, seen).exp()
         results.append(HeldOut(scores, probabilities))

@@ -55,7 +55,7 @@ class Estimates:
         return torch.stack(rows), [name for name in groups if name not in index]
 
     @classmethod
-    def of(cls, result: Fit) -> Estimates:
+    def from_fit(cls, result: Fit) -> Estimates:
         """Return what one fit found."""
         problem, errors = result.problem, result.uncertainty
         return cls(

@@ -65,6 +65,6 @@ def like(problem: Problem, other: Problem) -> Problem:
 
 def pooled_errors(problem: Problem, own: Tensor, shared: Tensor, items: Sequence[Episode]) -> Errors:
     """Return the errors on other episodes of values ``own`` [1, free] and ``shared`` that all drivers have."""
-    batch = Batch.of(items, substeps=problem.batch.substeps)
+    batch = Batch.stack(items, substeps=problem.batch.substeps)
     group, groups = group_of(batch.episodes, "all")
     return errors(dataclasses.replace(problem, batch=batch, group=group, groups=groups), own, shared)[0]

@@ -121,7 +121,7 @@ def fit(
         raise ValueError(f"method = '{method}' knows no prior. Use 'lm'.")
     if prior is not None and start is None:
         start = prior.centre, torch.empty(0, dtype=prior.centre.dtype)
-    batch = Batch.of(episodes, substeps=substeps)
+    batch = Batch.stack(episodes, substeps=substeps)
     group, names = group_of(batch.episodes, by)
     simulator = dataclasses.replace(simulator or base_simulator(), dt=batch.step)
     problem = Problem(

@@ -191,7 +191,7 @@ def _held_out(
 ) -> tuple[dict[str, Any], tuple[Repair, ...]]:
     """Return the errors on runs that the fit has not seen, and what of them was left out."""
     items = source.episodes(held)
-    batch = Batch.of(items, substeps=options.substeps)
+    batch = Batch.stack(items, substeps=options.substeps)
     group, names = group_of(batch.episodes, options.by)
     problem = Problem(
         dataclasses.replace(estimates.simulator, dt=batch.step), batch, estimates.names, (), group, names,
@@ -276,7 +276,7 @@ def _data_section(result: dict[str, Any]) -> list[page.Block]:
     ]
 
 
-def _seen(model: Model, trajectories: Trajectories, items: Episodes, error: Errors) -> dict[str, Any]:
+def _overlap(model: Model, trajectories: Trajectories, items: Episodes, error: Errors) -> dict[str, Any]:
     """Return how many episodes are of tracks that the model was fitted on, the error on the others, and it in words."""
     overlap = seen(trajectories, _drivers(items), model.fitted_on.get("tracks", ()))
     new = torch.tensor([driver not in (overlap or ()) for driver in _drivers(items)])
@@ -346,7 +346,7 @@ def _simulate_file(
         },
         "drivers_with_own_parameters": matched,
         "error": error.summary(),
-        "fitted_on": _seen(model, trajectories, items, error),
+        "fitted_on": _overlap(model, trajectories, items, error),
         "seed": seed,
         "versions": page.versions(),
     }
@@ -381,7 +381,7 @@ def in_words(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def problem_of(model: Model, items: Episodes, seed: int = 0) -> tuple[Problem, torch.Tensor, int]:
     """Return a problem with all P parameters of a model, their values [episodes, P] (SI), and the drivers matched."""
-    batch = Batch.of(items, substeps=model.substeps)
+    batch = Batch.stack(items, substeps=model.substeps)
     effects = behind_records(model)
     simulator = Simulator(Lane(), effects, dt=batch.step, integration=model.integration)
     names = tuple(f"{e.name}.{p.name}" for e in effects for p in e.parameters)

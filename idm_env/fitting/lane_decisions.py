@@ -50,8 +50,8 @@ class Decisions:
         """How many of them were changes."""
         return int((self.chosen > 0).sum())
 
-    def of(self, mask: Tensor) -> Decisions:
-        """Return the decisions that are chosen by a mask [N]."""
+    def select(self, mask: Tensor) -> Decisions:
+        """Return the decisions at a mask [N]."""
         return Decisions(
             _picked(self.scene, mask), _picked(dict(self.params), mask), self.possible[mask], self.chosen[mask],
             self.vehicle[mask], self.vehicles, self.every, self.left_out,

@@ -111,7 +111,7 @@ def integration_error(problem: Problem, own: Tensor, shared: Tensor) -> Tensor:
     """
     substeps = problem.batch.substeps
     other, scale = (substeps // 2, 1.0) if substeps > 1 else (2, 2.0)
-    batch = Batch.of(problem.batch.episodes, dtype=problem.batch.gap.dtype, substeps=other)
+    batch = Batch.stack(problem.batch.episodes, dtype=problem.batch.gap.dtype, substeps=other)
     coarse = dataclasses.replace(problem, batch=batch, simulator=dataclasses.replace(problem.simulator, dt=batch.step))
     fine, rough = (normal(p, own[None], shared[None]) for p in (problem, coarse))
     value = torch.cat((own, shared.expand(len(own), -1)), dim=-1)

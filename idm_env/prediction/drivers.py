@@ -85,7 +85,7 @@ class Second:
     stop: Stop | None
 
     @property
-    def driven(self) -> np.ndarray:
+    def distance_to_present(self) -> np.ndarray:
         """Distance to the present at every sample (m), falling to 0."""
         mean = 0.5 * (self.speeds[1:] + self.speeds[:-1]) * DT
         return np.asarray(np.concatenate([np.cumsum(mean[::-1])[::-1], [0.0]]))
@@ -166,7 +166,7 @@ def _fitted(cases: Sequence[tuple[Second, DriverHypothesis]]) -> tuple[np.ndarra
 def _episode(number: int, second: Second, h: DriverHypothesis) -> Episode:
     """Return the second as an episode behind the real leader, or behind the hypothesis' stop if that is nearer."""
     count = len(second.speeds)
-    position = second.route.begin + second.front - second.driven
+    position = second.route.begin + second.front - second.distance_to_present
     stop = second.route.begin + second.front + h.stop
     nearer = stop < second.ahead.rear
     rear = np.minimum(second.ahead.rear, stop)

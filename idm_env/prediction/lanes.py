@@ -103,7 +103,9 @@ class LaneGraph:
                 lanes.append(other.id)
         return tuple(lanes)
 
-    def on(self, point: np.ndarray, heading: float, *, bike: bool = False) -> list[tuple[int, float, float, float]]:
+    def lanes_at(
+        self, point: np.ndarray, heading: float, *, bike: bool = False
+    ) -> list[tuple[int, float, float, float]]:
         """Return (lane, arc length, lateral, weight) of every lane that an agent may be on, the likeliest first.
 
         The weight falls with the distance from the centre line (deviation 0.8 m) and the difference of direction
@@ -129,7 +131,7 @@ class LaneGraph:
         Every branch is followed; turns are taken to be half as likely as going straight on.
         """
         candidates: list[tuple[float, tuple[int, ...], float, float]] = []
-        for key, along, lateral, weight in self.on(point, heading, bike=bike)[:4]:
+        for key, along, lateral, weight in self.lanes_at(point, heading, bike=bike)[:4]:
             for chain in self._chains(key, along + reach):
                 candidates.append((weight * self._straightness(chain, along), chain, along, lateral))
         candidates.sort(key=lambda item: -item[0])

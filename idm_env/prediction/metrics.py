@@ -145,7 +145,7 @@ def intervals(scores: Sequence[Score], scenes: Sequence[str]) -> dict[str, tuple
     generator = np.random.default_rng(0)
     counts = [np.bincount(generator.integers(count, size=count), minlength=count) for _ in range(DRAWS)]
     weights = np.stack(counts)[:, unit].astype(float) if count > 1 else np.zeros((0, len(scores)))
-    return {name: _between(values) for name, values in _measures(scores, weights).items()}
+    return {name: _interval(values) for name, values in _measures(scores, weights).items()}
 
 
 def _measures(scores: Sequence[Score], weights: np.ndarray) -> dict[str, np.ndarray]:
@@ -199,7 +199,7 @@ def _means(values: Sequence[float | None], weights: np.ndarray) -> np.ndarray:
     return np.divide(weights[:, finite] @ numbers[finite], total, out=np.full(len(weights), np.nan), where=total > 0)
 
 
-def _between(values: np.ndarray) -> tuple[float, float]:
+def _interval(values: np.ndarray) -> tuple[float, float]:
     finite = values[np.isfinite(values)]
     if len(finite) < 2:
         return float("nan"), float("nan")

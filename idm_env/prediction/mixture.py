@@ -65,7 +65,7 @@ def share_of(shares: Shares, kind: str, speed: float, on_lane: bool) -> np.ndarr
     return np.asarray(share / share.sum())
 
 
-def seen(case: Case, futures: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Seen | None:
+def score_hits(case: Case, futures: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Seen | None:
     """Return how the futures [N, S, 2] of each way, with weights [N], hit the truth of a case; None without a truth."""
     rows = []
     for seconds in HORIZONS:

@@ -60,7 +60,7 @@ def mixture(scene: MapScene, index: int) -> Mixture:
     routes = scene.routes(agent)
     if not routes:
         return Mixture(index, (*futures, np.empty((0, STEPS, 2))), (*weights, np.empty(0)), {})
-    around = [scene.ahead(index, route) for route in routes]
+    around = [scene.leader_motion(index, route) for route in routes]
     seconds = [scene.second(agent, route, past) for route, (past, _) in zip(routes, around, strict=True)]
     drivers = posterior(seconds)
     courses = [
@@ -75,7 +75,7 @@ def mixture(scene: MapScene, index: int) -> Mixture:
     return Mixture(index, tuple(futures), tuple(weights), parameters)
 
 
-def chosen(scene: MapScene, ways: Mixture, shares: Shares = SHARES) -> Prediction:
+def choose_futures(scene: MapScene, ways: Mixture, shares: Shares = SHARES) -> Prediction:
     """Return up to six futures of an agent's mixture, and their confidences, with these shares of the ways.
 
     Constant velocity is always one of them, so that no agent is predicted worse than by it.
@@ -90,7 +90,7 @@ def chosen(scene: MapScene, ways: Mixture, shares: Shares = SHARES) -> Predictio
 
 def predict(scene: MapScene, index: int) -> Prediction:
     """Return up to six futures of an agent. ValueError if it is not valid at the present."""
-    return chosen(scene, mixture(scene, index))
+    return choose_futures(scene, mixture(scene, index))
 
 
 def _moments(name: str, drivers: list[RouteDrivers], shares: np.ndarray) -> tuple[float, float]:
@@ -151,12 +151,12 @@ def published_distance(scene: MapScene, index: int, cache: dict[int, np.ndarray]
         return cache[index]
     route, front = routes[0], 0.5 * agent.length
     leader = scene.leader(index, route)
-    past, future = scene.ahead(index, route)
+    past, future = scene.leader_motion(index, route)
     if leader is not None:
         gone = np.concatenate([[0.0], published_distance(scene, leader[0], cache)])
         future = type(future)(past.rear[-1] + gone, np.gradient(gone, DT))
     second = scene.second(agent, route, past)
-    own = route.begin + front - second.driven
+    own = route.begin + front - second.distance_to_present
     values = paper.START.copy()
     if len(second.speeds) > 1:
         values = paper.follow(own, float(second.speeds[0]), second.ahead.rear, second.ahead.speed, DT)

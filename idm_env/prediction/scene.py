@@ -97,7 +97,7 @@ class MapScene:
                 best = other, along, lateral
         return best
 
-    def ahead(self, index: int, route: Route, depth: int = 0) -> tuple[RouteLeader, RouteLeader]:
+    def leader_motion(self, index: int, route: Route, depth: int = 0) -> tuple[RouteLeader, RouteLeader]:
         """Return the vehicle ahead over the last second and over the future, by its own predicted motion."""
         leader = self.leader(index, route)
         if leader is None:
@@ -129,7 +129,7 @@ class MapScene:
         broken = np.flatnonzero(~valid)
         first = self.present - len(valid) + 1 + (int(broken[-1]) + 1 if len(broken) else 0)
         front = 0.5 * agent.length
-        stop = self.lines.ahead(route, front, self.speed(agent))
+        stop = self.lines.next_stop(route, front, self.speed(agent))
         return Second(
             route,
             self.speeds(agent)[first:],
@@ -148,8 +148,8 @@ class MapScene:
                 # entered first, so that a circle of leaders ends
                 self._travelled[index] = speed * DT * np.arange(1, STEPS + 1)
                 route, front = routes[0], 0.5 * agent.length
-                one = middle(speed, route.limit, self.lines.ahead(route, front, speed))
-                course = Course(route, one, self.ahead(index, route, depth)[1], route.begin)
+                one = middle(speed, route.limit, self.lines.next_stop(route, front, speed))
+                course = Course(route, one, self.leader_motion(index, route, depth)[1], route.begin)
                 (rolled,) = roll([course], speed, STEPS, front)
                 self._travelled[index] = rolled[0, :, 0] - route.begin
             else:

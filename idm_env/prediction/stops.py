@@ -49,7 +49,7 @@ class StopLines:
             else:
                 self._loose.append((control.shows, control.point))
 
-    def ahead(self, route: Route, front: float, speed: float) -> Stop | None:
+    def next_stop(self, route: Route, front: float, speed: float) -> Stop | None:
         """Return the next stop line of a route, None if there is none; ``front`` (m) is from centre to bumper."""
         shown = [item for lane in route.chain for item in self._by_lane.get(lane, ())]
         shown += [item for item in self._loose if abs(route.locate(item[1])[1]) < ON_LINE_M]

@@ -197,7 +197,7 @@ def account(
 ) -> str:
     """Return one line on the data: what was repaired and left out, by kind and number, and bad files by name."""
 
-    def counted(items: Iterable[tuple[str, int]]) -> str:
+    def count_kinds(items: Iterable[tuple[str, int]]) -> str:
         sums: dict[str, int] = {}
         for kind, count in items:
             sums[kind] = sums.get(kind, 0) + count
@@ -206,7 +206,7 @@ def account(
     names = list(bad_files)
     shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     files = f"{len(names)} bad file{'s' if len(names) > 1 else ''}: {shown}" if names else ""
-    parts = (("repaired: ", counted(repairs)), ("left out: ", counted(left_out)), ("", files))
+    parts = (("repaired: ", count_kinds(repairs)), ("left out: ", count_kinds(left_out)), ("", files))
     summary = "; ".join(title + words for title, words in parts if words)
     return f"Data: {summary}." if summary else "Data: nothing was repaired or left out."
 

@@ -167,7 +167,7 @@ def restored(parts: Parts, number: int, tracks: Sequence[TrackPiece]) -> list[Fi
         sigma = rows.select("position_sigma_m", "speed_sigma_mps", "accel_sigma_mps2").to_numpy()
         filtered.append(
             Filtered(
-                track, RegularMotion.of(rows), rows["imagined_gap_m"].to_numpy(), sigma,
+                track, RegularMotion.from_table(rows), rows["imagined_gap_m"].to_numpy(), sigma,
                 rows["leader_id"].fill_null("").to_numpy(), rows["lane"].fill_null(-1).to_numpy(),
                 rows["gap_m"].to_numpy(),
             )

@@ -324,5 +324,5 @@ def _shown(out: Path, spool: Spool, bridge: float | None) -> list[tuple[TrackPie
     for track in chosen:
         mine = (pl.col("run_id") == track.run_id) & (pl.col("vehicle_id") == track.vehicle_id)
         rows = written.filter(mine & (pl.col("piece") == track.piece)).collect()
-        pairs.append((track, RegularMotion.of(rows)))
+        pairs.append((track, RegularMotion.from_table(rows)))
     return pairs

@@ -29,7 +29,9 @@ def score(spool: Spool, plan: FilePlan, settings: FilterSettings) -> list[dict[s
 
     Tracks of fewer than five points are not scored; no row if there is no other.
     """
-    tracks = [t for table in spool.picked(_chosen(len(spool.vehicles))) for t in Pieces(table, None) if len(t) >= 5]
+    tracks = [
+        t for table in spool.picked(_sample_vehicles(len(spool.vehicles))) for t in Pieces(table, None) if len(t) >= 5
+    ]
     if not tracks:
         return []
     halves, out = zip(*(thinned(track) for track in tracks), strict=True)
@@ -44,7 +46,7 @@ def score(spool: Spool, plan: FilePlan, settings: FilterSettings) -> list[dict[s
     return [_row(name, motion, tracks, out, spacing) for name, motion in motions.items()]
 
 
-def _chosen(count: int) -> list[int]:
+def _sample_vehicles(count: int) -> list[int]:
     if count <= VEHICLES:
         return list(range(count))
     size = VEHICLES // BLOCKS
@@ -56,7 +58,7 @@ def _row(
     name: str, motions: list[RegularMotion], tracks: list[TrackPiece], out: tuple[np.ndarray, ...], spacing: float
 ) -> dict[str, Any]:
     apart = np.concatenate([
-        motion.at(track.time_s[index]) - track.position_m[index]
+        motion.position_at(track.time_s[index]) - track.position_m[index]
         for motion, track, index in zip(motions, tracks, out, strict=True)
     ])  # fmt: skip
     return {

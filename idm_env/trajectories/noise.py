@@ -80,7 +80,7 @@ def fit_noise(
         raise ValueError("no track has three samples to fit the noise to. Give noise=Noise(…).")
     usual = interval([time for time, _ in parts])
     dense = usual <= DENSE_S
-    observed = [TrackObservations.of(time, position, dt) for time, position in parts]
+    observed = [TrackObservations.on_clock(time, position, dt) for time, position in parts]
     inflated = [outlying(position) if dense else np.zeros(len(position)) for _, position in parts]
     search = _Search(observed, inflated, evaluations)
     if dense:

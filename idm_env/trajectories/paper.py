@@ -143,17 +143,19 @@ def follow(
     """
     origin = position_m[0]
     steps, target = np.arange(len(position_m)), position_m - origin
-    ahead = _ahead(rear_m - origin, pace)
+    ahead = _record_ahead(rear_m - origin, pace)
     result = _descended(RealLeader(), ahead, START[None], [speed0], dt, [steps], [target], FIVE, iterations)
     return np.array([result.params[f"idm.{name}"][0] for name in NAMES])
 
 
 def drive(values: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float) -> np.ndarray:
     """Return the distances [K] that the five values drive from 0 at ``speed0``, behind a leader as in ``follow``."""
-    return _descended(RealLeader(), _ahead(rear_m, pace), values[None], [speed0], dt, [], [], {}, 0).position[:-1, 0]
+    return _descended(RealLeader(), _record_ahead(rear_m, pace), values[None], [speed0], dt, [], [], {}, 0).position[
+        :-1, 0
+    ]
 
 
-def _ahead(rear_m: np.ndarray, pace: np.ndarray) -> Ahead:
+def _record_ahead(rear_m: np.ndarray, pace: np.ndarray) -> Ahead:
     return Ahead(*(torch.as_tensor(np.asarray(x, float))[:, None, None] for x in (rear_m, pace)))
 
 

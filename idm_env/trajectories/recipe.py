@@ -103,14 +103,14 @@ def recipe(
     """
     clocks = [clock_of(track, dt) for track in tracks]
     observed = [
-        TrackObservations.of(track.time_s, track.position_m, dt, len(clock))
+        TrackObservations.on_clock(track.time_s, track.position_m, dt, len(clock))
         for track, clock in zip(tracks, clocks, strict=True)
     ]
     smoothed = _smoothed(observed, noise, options)
     around = Neighbourhood([*tracks, *(f.track for f in before)], [*clocks, *(f.motion.time_s for f in before)])
     meetings = list(around.meetings())
     fixed = [f.motion.position_m for f in before]
-    driven = _driven(smoothed, dt, options)
+    driven = _drive(smoothed, dt, options)
     for _ in range(MOST_ROUNDS):
         positions = [*(d.position for d in driven), *fixed]
         ties = _ties(meetings, around, positions, len(tracks))
@@ -121,7 +121,7 @@ def recipe(
             for steps, value in ties[i]:
                 observed[i] = observed[i].bounded(steps, 0, value)
             smoothed[i] = smooth(observed[i], noise, options)
-        again = _driven([smoothed[i] for i in changed], dt, options)
+        again = _drive([smoothed[i] for i in changed], dt, options)
         for i, d in zip(changed, again, strict=True):
             driven[i] = d
     gaps = [np.full(len(clock), np.nan) for clock in around.clocks]
@@ -146,7 +146,7 @@ def _smoothed(observed: Sequence[TrackObservations], noise: PositionNoise, optio
         return list(pool.map(lambda o: smooth(o, noise, options), observed))
 
 
-def _driven(smoothed: Sequence[Smoothed], dt: float, options: SmootherOptions) -> list[Driven]:
+def _drive(smoothed: Sequence[Smoothed], dt: float, options: SmootherOptions) -> list[Driven]:
     return drive([(s.position, s.speed, s.accel) for s in smoothed], dt, options.highest, options.lowest)
 
 

@@ -137,7 +137,7 @@ def before_and_after(track: TrackPiece, motion: RegularMotion) -> Figure:
     middle = track.time_s[:-1] + step / 2 - begin
     speed = np.diff(track.position_m) / step
     clock = motion.time_s - begin
-    apart = track.position_m - motion.at(track.time_s)
+    apart = track.position_m - motion.position_at(track.time_s)
     axes[0].plot(track.time_s - begin, apart, ".", color=BEFORE, ms=3)
     reach = max(0.05, 1.1 * float(np.abs(apart).max()))
     axes[0].set_ylim(-reach, reach)

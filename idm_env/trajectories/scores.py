@@ -24,11 +24,11 @@ class RegularMotion:
     accel_mps2: np.ndarray
 
     @classmethod
-    def of(cls, table: pl.DataFrame) -> RegularMotion:
+    def from_table(cls, table: pl.DataFrame) -> RegularMotion:
         """Return the motion that rows of a written table [rows] tell."""
         return cls(*(table[each.name].to_numpy() for each in fields(cls)))
 
-    def at(self, time_s: np.ndarray) -> np.ndarray:
+    def position_at(self, time_s: np.ndarray) -> np.ndarray:
         """Return the positions (m) at other times (s), by linear interpolation between samples."""
         return np.interp(time_s, self.time_s, self.position_m)
 
@@ -50,7 +50,7 @@ def position_error_rate(motion: RegularMotion, time_s: np.ndarray, position_m: n
     NaN for a track that does not move.
     """
     length = float(np.abs(np.diff(position_m)).sum())
-    error = float(np.abs(motion.at(time_s) - position_m).mean())
+    error = float(np.abs(motion.position_at(time_s) - position_m).mean())
     return error / length if length > 0 else float("nan")
 
 

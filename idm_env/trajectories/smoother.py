@@ -86,7 +86,9 @@ class TrackObservations:
     measured: np.ndarray
 
     @classmethod
-    def of(cls, time_s: np.ndarray, position_m: np.ndarray, dt: float, steps: int | None = None) -> TrackObservations:
+    def on_clock(
+        cls, time_s: np.ndarray, position_m: np.ndarray, dt: float, steps: int | None = None
+    ) -> TrackObservations:
         """Put samples on the clock ``time_s[0] + k dt``; a sample between ticks is seen from the tick before it."""
         since = (time_s - time_s[0]) / dt
         ticks = np.floor(since + 1e-6).astype(np.int64)

@@ -95,7 +95,7 @@ class Pieces:
         self._length = frame["length_m"].to_numpy()
         self.vehicles = table.vehicles()
 
-    def of(self, vehicles: list[tuple[str, str, int, int]]) -> Iterator[TrackPiece]:
+    def of_vehicles(self, vehicles: list[tuple[str, str, int, int]]) -> Iterator[TrackPiece]:
         """Yield the tracks of some vehicles, as ``vehicles`` lists them."""
         for run, vehicle, first, count in vehicles:
             rows = slice(first, first + count)
@@ -106,7 +106,7 @@ class Pieces:
             yield from self._usable(whole)
 
     def __iter__(self) -> Iterator[TrackPiece]:
-        return self.of(self.vehicles)
+        return self.of_vehicles(self.vehicles)
 
     def _usable(self, whole: TrackPiece) -> Iterator[TrackPiece]:
         name = f"{whole.run_id}/{whole.vehicle_id}"

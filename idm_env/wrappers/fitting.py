@@ -72,7 +72,7 @@ class ParameterFitting:
         self.problem = Problem(
             simulator,
             # One step of the simulation per step of the environment: what is fitted is what will be driven.
-            Batch.of(self.episodes, substeps=1),
+            Batch.stack(self.episodes, substeps=1),
             self.free,
             (),
             group,

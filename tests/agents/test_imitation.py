@@ -45,7 +45,7 @@ def test_a_policy_that_does_what_idm_does_is_idm(data):
     """The rollout of the policy is that of the simulator: IDM's own acceleration as the policy gives IDM's rollout."""
     from idm_env.fitting.fit import base_simulator
 
-    batch = Batch.of(episodes(imitation.load(data), max_gap=None), dtype=torch.float32, substeps=1)
+    batch = Batch.stack(episodes(imitation.load(data), max_gap=None), dtype=torch.float32, substeps=1)
     simulator = base_simulator(0.1)
     params = simulator.defaults(dtype=torch.float32)
     driver = {k: float(v) for k, v in params["idm"].items()}
@@ -66,7 +66,7 @@ def test_the_closed_loop_lowers_the_error_that_it_follows(data, tmp_path):
     torch.manual_seed(0)
     a = arguments(data, tmp_path)
     training, _ = imitation.split(a)
-    batch = Batch.of(windows(training, 20.0), dtype=torch.float32, substeps=1)
+    batch = Batch.stack(windows(training, 20.0), dtype=torch.float32, substeps=1)
     policy = imitation.cloned(a, training)
     optimiser = torch.optim.Adam(policy.parameters(), lr=3e-3)
     losses = []

@@ -33,7 +33,7 @@ def test_every_episode_is_there_in_order_with_everybody_around(items: list[Episo
 
 
 def test_a_batch_and_the_records_of_discovery_show_the_same_samples(items: list[Episode]) -> None:
-    batch, records = Batch.of(items, substeps=2), gather(items)
+    batch, records = Batch.stack(items, substeps=2), gather(items)
     for r, episode in enumerate(items):
         measured = batch.valid[:, r] > 0
         flat = slice(records.first[r], records.bounds[r + 1])

@@ -40,7 +40,7 @@ def test_the_loop_of_a_law_is_the_simulator(platoon: Records, name: str) -> None
     model = Hypothesis((), Catalogue((), law, located=False))
     mine = problem.predict(np.tile(prior.centre, (1, problem.groups, 1)), model, np.zeros((1, 0)))[0][0]
     simulator = Simulator(Lane(), (law, Replay(), Brakes()), dt=platoon.dt, integration="midpoint")
-    batch = Batch.of(platoon.episodes, substeps=1)
+    batch = Batch.stack(platoon.episodes, substeps=1)
     measured = FitProblem(simulator, batch, (), (), torch.zeros(len(batch), dtype=torch.long), ("all",), kernels=False)
     given = zip(law.declared, np.exp(prior.centre), strict=True)
     values = {f"{name}.{p.name}": torch.full((len(batch),), float(x), dtype=torch.float64) for p, x in given}

@@ -72,7 +72,7 @@ def simulated(records: Records, model: Hypothesis, values: np.ndarray) -> np.nda
     """The gap of the simulator, on the samples that discovery keeps."""
     effects, numbers = terms.effects_of(model, values)
     simulator = Simulator(Lane(), (IDM(), Replay(), *effects, Brakes()), dt=records.dt, integration="midpoint")
-    batch = Batch.of(records.episodes, substeps=1)
+    batch = Batch.stack(records.episodes, substeps=1)
     problem = FitProblem(
         simulator, batch, (), (), torch.zeros(len(batch), dtype=torch.long), ("all",), kernels=False
     )  # fmt: skip

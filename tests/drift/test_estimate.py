@@ -83,7 +83,7 @@ def both(made: Trajectories) -> tuple[list[Episode], list[Episode]]:
 
 
 def estimated(drift: Effect, sigma: float, memory_time: float, known: bool) -> Estimate:
-    smooth, raw = (Batch.of(x, substeps=1) for x in both(driven(drift, sigma, memory_time)))
+    smooth, raw = (Batch.stack(x, substeps=1) for x in both(driven(drift, sigma, memory_time)))
     theta, spread = (np.log([TRUE[n] for n in IDM_NAMES]), 0.0) if known else (usual(IDM_NAMES), 0.3)
     return estimate(behind_a_record(drift), smooth, IDM_NAMES, theta, spread=spread, measured=raw)
 
@@ -202,6 +202,6 @@ def test_scores_of_a_known_normal() -> None:
 def test_a_driver_who_looks_back_is_refused() -> None:
     """A step about a path has no past."""
     smooth, _ = both(driven(Wander(), 0.1, 5.0))
-    batch = Batch.of(smooth[:1], substeps=1)
+    batch = Batch.stack(smooth[:1], substeps=1)
     with pytest.raises(ValueError, match="'delay' looks back"):
         estimate(behind_a_record(Delay()), batch, IDM_NAMES, np.zeros((1, 5)))

@@ -197,7 +197,7 @@ def test_the_published_benchmark_is_reproduced(measured: Callable[[str], Path]) 
     """NGSIM I-80, 20 test pairs, published parameters: spacing RMSE 3.694 m and MAE 3.067 m (trapezoidal update)."""
     path = measured("ngsim_i80_pairs.parquet")
     items = episodes(load(path).where("in_manifest=true").split("split=test")[1], max_gap=None)
-    batch = Batch.of(items, substeps=1)
+    batch = Batch.stack(items, substeps=1)
     group, names = group_of(batch.episodes, "all")
     for integration, expected in (("ballistic", 3.694), ("euler", 3.701)):
         simulator = Simulator(Lane(), (IDM(), Replay(), Brakes()), dt=batch.step, integration=integration)  # type: ignore[arg-type]
@@ -216,7 +216,7 @@ def test_the_pooled_fit_of_the_published_benchmark(measured: Callable[[str], Pat
     training, test = (episodes(part, max_gap=None) for part in trajectories.split("split=test"))
     assert (len(training), len(test)) == (100, 20)
     found = fit(training, by="all")
-    batch = Batch.of(test)
+    batch = Batch.stack(test)
     group, names = group_of(batch.episodes, "all")
     problem = dataclasses.replace(found.problem, batch=batch, group=group, groups=names)
     error, _ = errors(problem, found.own, found.shared)

@@ -25,7 +25,7 @@ def problem_of(
     items: Episodes, *effects: str, substeps: int = 1, shared: tuple[str, ...] = (), **options: object
 ) -> Problem:
     """Return a per-driver problem of IDM with further effects."""
-    batch = Batch.of(items, substeps=substeps)
+    batch = Batch.stack(items, substeps=substeps)
     simulator = Simulator(Lane(), (IDM(), Replay(), Brakes(), *(make(e) for e in effects)), dt=batch.step)
     group, names = group_of(batch.episodes, "driver")
     return Problem(simulator, batch, IDM_NAMES, shared, group, names, **options)  # type: ignore[arg-type]
@@ -128,7 +128,7 @@ def test_a_corrected_model_is_compiled(
 def test_a_batch_starts_measured_and_counts_only_what_was_measured(platoon: tuple[Episodes, Truth]) -> None:
     """Rows of different length: padding has no weight, and the record is met at every sample."""
     items = Episodes((platoon[0][0].part(0, 300), platoon[0][1]), ())
-    batch = Batch.of(items, substeps=4)
+    batch = Batch.stack(items, substeps=4)
     assert batch.valid.sum(0).tolist() == [300.0, float(len(items[1]))]
     assert batch.steps == (len(items[1]) - 1) * 4
     np.testing.assert_allclose(batch.gap[:300, 0].numpy(), items[0].gap_m)
@@ -150,13 +150,13 @@ def test_an_effect_of_ones_own_is_given_what_was_measured_of_its_kind(platoon: t
 
     items = Episodes(tuple(e.part(0, 100) for e in platoon[0][:1]), ())
     ours, given = (
-        Batch.of(items, substeps=1).inputs(Simulator(Lane(), (IDM(), Replay(), Brakes(), effect), dt=0.1))
+        Batch.stack(items, substeps=1).inputs(Simulator(Lane(), (IDM(), Replay(), Brakes(), effect), dt=0.1))
         for effect in (Beside(), Lateral())
     )
     for mine, known in zip(ours["beside"], given["lateral"], strict=True):
         torch.testing.assert_close(mine, known)
     with pytest.raises(DataError, match="effect 'fancied' takes an input that measured data do not have"):
-        Batch.of(items, substeps=1).inputs(Simulator(Lane(), (IDM(), Replay(), Brakes(), Fancied()), dt=0.1))
+        Batch.stack(items, substeps=1).inputs(Simulator(Lane(), (IDM(), Replay(), Brakes(), Fancied()), dt=0.1))
 
 
 def test_windows_cover_everything_once(platoon: tuple[Episodes, Truth]) -> None:
@@ -179,6 +179,6 @@ def test_errors(platoon: tuple[Episodes, Truth]) -> None:
     with pytest.raises(DataError, match="cannot group by 'vehicle'"):
         group_of(problem.batch.episodes, "vehicle")
     with pytest.raises(DataError, match="no episode"):
-        Batch.of([])
+        Batch.stack([])
     with pytest.raises(DataError, match=r"steps of 0\.1 and 0\.2 s"):
-        Batch.of([platoon[0][0], dataclasses.replace(platoon[0][1], dt=0.2)])
+        Batch.stack([platoon[0][0], dataclasses.replace(platoon[0][1], dt=0.2)])

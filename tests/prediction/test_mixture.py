@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from idm_env.prediction.metrics import Case
-from idm_env.prediction.mixture import PRIOR_AGENTS, Seen, fit_shares, pace_of, seen, share_of
+from idm_env.prediction.mixture import PRIOR_AGENTS, Seen, fit_shares, pace_of, score_hits, share_of
 
 STEPS = 80
 
@@ -59,9 +59,9 @@ def test_what_is_seen_of_an_agent_is_the_weighted_share_that_hits_at_the_known_h
     valid[60:] = False
     case = Case(line[None], np.ones(1), line, np.zeros(STEPS), valid, 10.0, "straight", "vehicle")
     near, far = line, line + np.array([0.0, 50.0])
-    found = seen(case, [near[None], np.stack([near, far]), np.empty((0, STEPS, 2))],
+    found = score_hits(case, [near[None], np.stack([near, far]), np.empty((0, STEPS, 2))],
                  [np.ones(1), np.array([3.0, 1.0]), np.empty(0)])  # fmt: skip
     assert found is not None and (found.kind, found.pace) == ("vehicle", "moving")
     assert np.array_equal(found.hit, [[1.0, 0.75, np.nan]] * 2, equal_nan=True)
     case.valid[:] = False
-    assert seen(case, [near[None]], [np.ones(1)]) is None
+    assert score_hits(case, [near[None]], [np.ones(1)]) is None

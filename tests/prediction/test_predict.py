@@ -106,7 +106,7 @@ def test_stop_signs_are_for_the_lane_at_whose_end_they_stand_and_lights_for_thei
     away = float(end[0] + 40.0 - 2.25)
 
     def stop(*controls: TrafficControl) -> Stop | None:
-        return StopLines(graph, controls).ahead(route, 2.25, 10.0)
+        return StopLines(graph, controls).next_stop(route, 2.25, 10.0)
 
     assert stop(TrafficControl("sign", end + np.array([-3.0, -4.0]))) == Stop(pytest.approx(away, abs=0.2), "sign")
     assert (
@@ -123,7 +123,7 @@ def test_stop_signs_are_for_the_lane_at_whose_end_they_stand_and_lights_for_thei
     assert stop(TrafficControl("caution", end, lanes=(1,))) is not None
     near = graph.routes(np.array([-12.0, 0.0]), 0.0, 100.0)[0]
     assert (
-        StopLines(graph, [TrafficControl("caution", end, lanes=(1,))]).ahead(near, 2.25, 12.0) is None
+        StopLines(graph, [TrafficControl("caution", end, lanes=(1,))]).next_stop(near, 2.25, 12.0) is None
     )  # too late to brake
 
 

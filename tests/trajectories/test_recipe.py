@@ -45,7 +45,7 @@ def test_without_reweighting_it_is_the_exact_posterior() -> None:
     noise, dt = PositionNoise(white=0.1, sigma=0.3, time=0.4, jerk=0.5), 0.1
     time = np.array([0.0, 0.1, 0.23, 0.3, 0.4, 0.9, 1.0, 1.15, 1.2])
     data = 10 * time + np.sin(5 * time)
-    observed = TrackObservations.of(time, data, dt)
+    observed = TrackObservations.on_clock(time, data, dt)
     steps, n = observed.steps, 4
     keep, fade, push, drift = noise.step(dt)
     step = np.array([[1, dt, dt * dt / 2, 0], [0, 1, dt, 0], [0, 0, keep, 0], [0, 0, 0, fade]])
@@ -102,7 +102,7 @@ def test_noise_of_sparse_data_is_found_too_and_taken_away(every: int) -> None:
         f.motion.speed_mps - m.speed_mps for f, m in zip(recipe(sparse, 0.1, noise, SPARSE), motions, strict=True)
     ]
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.6
-    clean = fit_noise([(t.time_s, m.at(t.time_s)) for t, m in zip(sparse, motions, strict=True)], 0.1)
+    clean = fit_noise([(t.time_s, m.position_at(t.time_s)) for t, m in zip(sparse, motions, strict=True)], 0.1)
     assert clean.white < 0.1
 
 
