@@ -1,8 +1,8 @@
 """What needs no learning: families of policies beside which a test of agents on the ring says what it is worth.
 
-Constants, proportional rules, Krauß's safe speed, FollowerStopper, random networks, and an oracle that is told the
-uniform speed. All policies of a family drive the same rings at once. A task that more than 5 % of the random policies
-pass is no test.
+Constants, proportional rules, one line of a gap, Krauß's safe speed, FollowerStopper, random networks, and an oracle
+that is told the uniform speed. All policies of a family drive the same rings at once. A task that more than 5 % of the
+random policies pass is no test.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from torch.func import functional_call, stack_module_state, vmap
 
 from agents.classical import FollowerStopper, PISaturation, Seen, seen
 from agents.environments import first_seed, human_driving, task_of
-from agents.evaluate import STEPS, evaluate_ring, judge_ring, score
+from agents.evaluate import STEPS, evaluate_ring, judge_ring, judged_rings, score
 from agents.policy import Policy
-from agents.rollout import FRESH, LENGTHS, Act, Driven, Start, drive, ring_start, uniform_speed
+from agents.rollout import FRESH, Act, Driven, Start, drive, uniform_speed
 from idm_env.tasks import Task
 from idm_env.tasks.failsafe import safe_accel
 from idm_env.types import mapped
@@ -134,6 +134,10 @@ def families(environment: Mapping[str, Any], count: int = 200) -> dict[str, Call
             "{:g} Δv + {:g} (s − 2 m − v · {:g} s)",
             (0.1, 0.3, 0.6, 1.0), (0.01, 0.03, 0.1, 0.2, 0.5), (0.5, 1.0, 1.5, 2.0),
         ),
+        "one line of a gap": lambda: grid(
+            lambda task, view, uniform, g, gap: g * (view.gap - gap), "{:g} s⁻² (s − {:g} m)",
+            (0.001, 0.002, 0.004, 0.008, 0.016), (3.0, 4.0, 5.0),
+        ),
         "Krauß's safe speed and a constant": lambda: grid(
             lambda task, view, uniform, accel, decel, seconds: torch.minimum(accel, safe(task, view, decel, seconds)),
             "{:g} m/s², b = {:g} m/s², τ = {:g} s",
@@ -163,7 +167,7 @@ def judge(
     family: Family, environment: Mapping[str, Any], draws: Sequence[int], chosen: Sequence[int]
 ) -> list[dict[str, Any]]:
     """Return the figures of the chosen policies of a family, each on one ring of every length and draw."""
-    start = ring_start(environment, LENGTHS, draws=draws)
+    start = judged_rings(environment, draws=draws)
     rings = len(start.world.state.speed)
     rows, at_once = [], max(1, ROWS_AT_ONCE // rings)
     for part in (chosen[i : i + at_once] for i in range(0, len(chosen), at_once)):

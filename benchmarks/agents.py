@@ -85,8 +85,10 @@ SHOCKS: dict[str, dict[str, Any]] = {
     "": {"shock": 0.0},
     "-shock": {"shock": 4.0},
     "-two-shocks": {"shock": 5.0, "shock_after": [60.0, 120.0]},
+    "-long": {"shock": 4.0, "vehicles": 44, "length": [440.0, 540.0]},
 }
-"""What the human opposite does, by how the names of tests end: nothing, brake once, or harder and twice."""
+"""What the human opposite does, by how the names of tests end: nothing, brake once, harder and twice, or once on a ring
+of 44, where one vehicle has twice as many humans to calm."""
 TESTS = (*(ring + shock for ring in ("failsafe", "brakes") for shock in SHOCKS), "follow")
 """Of the reference rows (``tests``)."""
 SEARCH_SEEDS, SEEDS = (100, 101), tuple(range(10))

@@ -1,17 +1,13 @@
 """Environment steps per second beside HighwayEnv, and what warm-up costs.
 
 CPU time of one thread, everything in one run, so that ratios hold wherever it runs: ratios are the figures to compare,
-rates depend on the machine. Run: python -m benchmarks.environments [--quick]. With --returns it writes what episodes of
-every task return under no command, IDM, the best rule that a search finds and an agent: 5 seeds.
+rates depend on the machine. Run: python -m benchmarks.environments [--quick].
 """
 
 from __future__ import annotations
 
-import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -23,9 +19,7 @@ from benchmarks.bench.gradients import rows as steps_with_gradients
 from benchmarks.bench.measure import rate, turning
 from benchmarks.bench.peers import highway
 from idm_env.effects import CANDIDATES
-from idm_env.tasks import TASKS
 
-ROOT = Path(__file__).resolve().parents[1]
 warnings.filterwarnings("ignore")
 
 
@@ -134,90 +128,15 @@ def warmup(count: int) -> None:
     print(f"  making the pool once (256 worlds, ms in all) {1e3 * (time.process_time() - begin):12.1f}")
 
 
-GENERATIONS, RULES, JUDGED_ON = 6, 16, range(5)
-"""Turns of the search for a rule, rules of each, and seeds of what is reported."""
-RANGES = ((2.5, 40.0), (0.1, 3.0), (0.3, 6.0), (0.3, 3.0), (0.5, 4.0), (0.005, 1.0))
-"""Where rules are looked for: v0 (m/s), T (s), s0 (m), a, b (m/s²), and the share of IDM's acceleration."""
-
-
-def write_returns(tasks: list[str], out: Path) -> None:
-    """Write the returns of an episode of every task, a row each: zero action, IDM, best rule, best agent."""
-    sys.path.insert(0, str(ROOT / "examples"))
-    import train_apg
-
-    rows = [line.split(",") for line in out.read_text().splitlines()[1:]] if out.exists() else []
-    for task in tasks:
-        begin = time.process_time()
-        env = gym.make("DiffIDM-v0", task=task)
-        limit, shape = env.unwrapped.task.command_limits[1], env.action_space.shape
-
-        def of(rules: torch.Tensor, seeds: Sequence[int], task=task, limit=limit) -> torch.Tensor:
-            act = rule(rules.repeat_interleave(len(seeds), 0), limit)
-            return train_apg.returns(task, act, [*seeds] * len(rules)).view(len(rules), -1)
-
-        best = searched(of)
-        by_policy = {
-            "zero action": train_apg.returns(task, lambda seen, shape=shape: torch.zeros(len(seen), *shape), JUDGED_ON),
-            "IDM": train_apg.returns(task, None, JUDGED_ON),
-            "best rule": of(best.unsqueeze(0), JUDGED_ON)[0],
-        }
-        print(f"{task}: v0, T, s0, a, b, share: {', '.join(f'{x:.3g}' for x in best)}")
-        if task in train_apg.RECIPES:
-            policy = train_apg.trained(task, shown=lambda words: None)
-            by_policy["best agent"] = train_apg.returns(task, policy, JUDGED_ON)
-        rows = [row for row in rows if row[0] != task]
-        for name, each in by_policy.items():
-            rows.append([task, name, *(f"{x:.1f}" for x in (each.mean(), each.min(), each.max()))])
-        print(f"{task}: {time.process_time() - begin:.0f} CPU s", *rows[-len(by_policy) :], sep="\n  ", flush=True)
-        rows.sort(key=lambda row: list(TASKS).index(row[0]))  # stable: policies stay in their order
-        out.write_text("\n".join(["task,policy,mean,lowest,highest", *(",".join(row) for row in rows)]) + "\n")
-
-
-def searched(of: Callable[[torch.Tensor, Sequence[int]], torch.Tensor]) -> torch.Tensor:
-    """Return the rule with the best mean return, by the cross-entropy method over the logarithms of its numbers.
-
-    ``of`` gives the returns ``(rules, seeds)``. Every generation drives other episodes; the best quarter is the next
-    one's middle, and the best of the last are compared on ten episodes more. None of these are reported.
-    """
-    drawing = torch.Generator().manual_seed(0)
-    low, high = torch.tensor(RANGES).log().unbind(-1)
-    middle, spread = (low + high) / 2.0, (high - low) / 2.0
-    for generation in range(GENERATIONS):
-        rules = (middle + spread * torch.randn(RULES, len(RANGES), generator=drawing)).clamp(low, high)
-        rules[0] = middle
-        paid = of(rules.exp(), range(100 + 4 * generation, 104 + 4 * generation)).mean(1)
-        best = rules[paid.topk(RULES // 4).indices]
-        middle, spread = best.mean(0), best.std(0) + 0.05 * (high - low)
-    best = torch.cat([best, middle.unsqueeze(0)]).exp()
-    return best[int(of(best, range(200, 210)).mean(1).argmax())]
-
-
-def rule(values: torch.Tensor, limit: float) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return actions of IDM's formula with a row of values per environment, times a share; as in ``train_apg``."""
-    v0, headway, s0, a, b, share = values.unsqueeze(1).unbind(-1)
-
-    def act(seen: torch.Tensor) -> torch.Tensor:
-        speed, lead, gap = seen.reshape(len(values), -1, 3).unbind(-1)
-        wish = s0 + (speed * headway + speed * (speed - lead) / (2.0 * (a * b).sqrt())).clamp_min(0.0)
-        accel = share * a * (1.0 - (speed / v0) ** 4 - (wish / gap.clamp_min(0.5)) ** 2)
-        return (accel / limit).clamp(-1.0, 1.0)
-
-    return act
-
-
-def main(quick: bool = False, envs: int = 4096, gradients: bool = False, returns: Sequence[str] | None = None) -> None:
+def main(quick: bool = False, envs: int = 4096, gradients: bool = False) -> None:
     """Print rates of steps, with their gradients and without, and what a warm-up costs.
 
     Args:
         quick: Short measurements.
         envs: Environments of a vector.
         gradients: Only steps with their gradients.
-        returns: Only the returns of these tasks, of all if none is named, into docs/returns.csv.
     """
     torch.set_num_threads(1)
-    if returns is not None:
-        write_returns(list(returns or TASKS), ROOT / "docs" / "returns.csv")
-        return
     gradient_steps(3 if quick else 7)
     if gradients:
         return

@@ -134,7 +134,7 @@ def _faces(name: str) -> list[str]:
         f"Per agent: {actions} in [−1, 1]; −1 and 1 command {low:g} and {high:g} m/s².", "",
         "## Reward", "",
         *_rewards(task), "",
-        *_returns(name),
+        *_skill(name),
         "## Ends", "",
         f"An episode is terminated where vehicles touch, and truncated after {task.horizon} steps of "
         f"{task.step_time:g} s.", "",
@@ -196,18 +196,19 @@ def _meaning(function: Any) -> str:
     return text.replace("``", "`").replace("|", "\\|")
 
 
-def _returns(name: str) -> list[str]:
-    """Return the table of returns of a task, as ``benchmarks.environments --returns`` measured them."""
-    rows = [line.split(",") for line in (ROOT / "docs" / "returns.csv").read_text(encoding="utf-8").splitlines()[1:]]
+def _skill(name: str) -> list[str]:
+    """Return the table of skill of a task, as ``benchmarks.tasks`` measured it; nothing where it was not."""
+    rows = [line.split(",") for line in (ROOT / "docs" / "skill.csv").read_text(encoding="utf-8").splitlines()[1:]]
     mine = [row[1:] for row in rows if row[0] == name]
+    if not mine:
+        return ["## Skill", "", f"Not measured yet: `python -m benchmarks.tasks {name}`.", ""]
     return [
-        "## Returns", "",
-        "| 5 episodes, seeds 0 to 4 | mean | lowest | highest |", "| --- | --- | --- | --- |",
+        "## Skill", "", "(return − human)/(best row − human), 64 fresh episodes, ± 95 % of the paired difference.", "",
+        "| row | seed | return | skill | ± | crashes | CPU s |", "| --- | --- | --- | --- | --- | --- | --- |",
         *(f"| {' | '.join(row)} |" for row in mine), "",
-        f"The agent is `python examples/train_apg.py {name} 0`, one seed. IDM drives without commands, which costs "
-        "nothing. The best rule is IDM's formula as commands, with the parameters that a search found on other seeds; "
-        "the agent begins there. Both see speed, the leader's and the gap. "
-        "`python -m benchmarks.environments --returns`, 2026-11-23, 2 cores, no GPU.", "",
+        "*Human* is `step(None)`. *Rule* is IDM's formula as commands, its numbers found by a search that sees only "
+        "returns; *PPO* the ten lines of README, last policy of each seed. "
+        f"`python -m benchmarks.tasks {name}`, 2026-11-25, one thread, no GPU.", "",
     ]  # fmt: skip
 
 
@@ -222,8 +223,9 @@ def _described(cls: Any) -> tuple[str, list[str]]:
 def _keywords(cls: Any, base: Any) -> list[str]:
     """Return the keywords of a task, or those that it has beside its base, with their defaults and meanings."""
     told = _arguments(cls)
+    common = {} if base is None else _arguments(base)
     known = set() if base is None else {f.name for f in dataclasses.fields(base)}
-    fields = [f for f in dataclasses.fields(cls) if f.init and (f.name not in known or f.name in told)]
+    fields = [f for f in dataclasses.fields(cls) if f.name not in known or told.get(f.name) != common.get(f.name)]
     if not fields:
         return []
     lines = ["| keyword | default | meaning |", "| --- | --- | --- |"]
@@ -235,16 +237,13 @@ def _keywords(cls: Any, base: Any) -> list[str]:
 
 
 def _arguments(cls: Any) -> dict[str, str]:
-    """Return what a docstring says of each argument."""
-    text = inspect.cleandoc(cls.__doc__ or "")
-    found = re.search(r"\nArgs:\n(.*?)(?:\n\S|\Z)", text, re.DOTALL)
-    if not found:
-        return {}
-    entries = re.split(r"\n(?=    \w+(?:, \w+)*: )", "\n" + textwrap.dedent(found[1]).replace("\n    ", "\n        "))
-    told = {}
-    for entry in re.findall(r"(?m)^    ?(\w+): ((?:.|\n(?!    ?\w+: ))*)", found[1]):
-        told[entry[0]] = " ".join(entry[1].split()).replace("``", "`")
-    return told if told or not entries else {}
+    """Return what the docstrings of a class and its bases say of each argument, the class's own first."""
+    told: dict[str, str] = {}
+    for kind in reversed(cls.__mro__):
+        found = re.search(r"\nArgs:\n(.*?)(?:\n\S|\Z)", inspect.cleandoc(vars(kind).get("__doc__") or ""), re.DOTALL)
+        for name, meaning in re.findall(r"(?m)^    ?(\w+): ((?:.|\n(?!    ?\w+: ))*)", found[1] if found else ""):
+            told[name] = " ".join(meaning.split()).replace("``", "`")
+    return told
 
 
 # -- effects ---------------------------------------------------------------------------------------------------------
@@ -444,7 +443,7 @@ def commands() -> str:
                 continue
             argument = isinstance(p, click.Argument) or p.param_type_name == "argument"
             names = f"`{p.name.upper()}`" if argument else " ".join(f"`{o}`" for o in (*p.opts, *p.secondary_opts))
-            default = "" if p.default is None or callable(p.default) else f"`{p.default}`"
+            default = "–" if p.default is None or callable(p.default) else f"`{p.default}`"
             meaning = (getattr(p, "help", None) or "").replace("|", "\\|")
             lines.append(f"| {names} | {default} | {meaning} |")
         lines.append("")

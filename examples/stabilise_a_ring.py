@@ -9,6 +9,7 @@ torch.manual_seed(0)
 torch.set_num_threads(1)
 # Human drivers have had 300 s to grow a wave; the failsafe brakes for the queue, and learning must drive on from there.
 ring = {"task": "ring", "output": "torch", "observation": "raw", "warmup": 3000, "warmup_pool": 64, "failsafe": 3.0}
+ring |= {"reward": "flow", "shock": 0.0}  # mean speed less effort; nobody brakes but for the queue
 env = gymnasium.make_vec("DiffIDM-v0", num_envs=24, autoreset_mode="SameStep", max_episode_steps=3000, **ring)
 test = gymnasium.make_vec("DiffIDM-v0", num_envs=4, autoreset_mode="Disabled", max_episode_steps=-1, **ring)
 

@@ -9,7 +9,14 @@ import cma  # pip install cma
 import gymnasium
 import numpy as np
 
-ROAD = {"task": "approach", "lanes_count": 1, "inflow": 600.0, "vehicles": 60, "info": ["co2", "outflow"]}
+ROAD = {
+    "task": "approach",
+    "lanes_count": 1,
+    "inflow": 600.0,
+    "vehicles": 60,
+    "reward": "delay",
+    "info": ["co2", "outflow"],
+}
 LOW, HIGH = np.array([0.0, 3.0, 1.0, 50.0, 0.0]), np.array([15.0, 14.0, 10.0, 500.0, 1.0])
 GREEN_WAVE = np.array([0.0, 5.0, 2.0, 500.0, 0.0])  # arrive when it becomes green, at 5 m/s at least
 
@@ -17,7 +24,14 @@ GREEN_WAVE = np.array([0.0, 5.0, 2.0, 500.0, 0.0])  # arrive when it becomes gre
 def returns(advice, seeds):
     """Return what episodes pay (vehicle-hours), emit (kg CO2) and let out, by advice (n, 5) or none, for each seed."""
     count = (1 if advice is None else len(advice)) * len(seeds)
-    env = gymnasium.make_vec("idm_env:DiffIDM-v0", num_envs=count, autoreset_mode="Disabled", observation="raw", **ROAD)
+    env = gymnasium.make_vec(
+        "idm_env:DiffIDM-v0",
+        num_envs=count,
+        autoreset_mode="Disabled",
+        observation="raw",
+        **ROAD,
+        info=["co2", "outflow"],
+    )
     seen, paid, burnt = env.reset(seed=[*seeds] * (count // len(seeds)))[0], np.zeros(count), np.zeros(count)
     names, red = env.unwrapped.task.bounds.names, env.unwrapped.task.cycle - env.unwrapped.task.green
     for _ in range(600):

@@ -10,8 +10,16 @@ SEEN = {"features": ["speed", "lead_speed", "gap", "lane"], "scaling": "raw"}
 HUMAN = np.array([30.0, 1.2, 2.0, 1.5, 2.0])  # IDM's v0 (m/s), T (s), s0 (m), a and b (m/s²)
 LOW, HIGH = np.log([[20.0, 0.5, 1.0, 0.8, 0.8], [40.0, 2.0, 4.0, 2.5, 3.0]])
 turns, rows = map(int, sys.argv[1:3] or (5, 60))  # fewer are quicker
-chosen = {"task": "merge", "controlled": 0.3, "careful": False, "added": True, "observation": SEEN, "info": "none"}
-env = gymnasium.make_vec("idm_env:DiffIDM-v0", num_envs=rows, autoreset_mode="Disabled", **chosen)
+chosen = {
+    "task": "merge",
+    "reward": "delay",
+    "controlled": 0.3,
+    "careful": False,
+    "added": True,
+    "observation": SEEN,
+    "info": "none",
+}
+env = gymnasium.make_vec("idm_env:DiffIDM-v0", num_envs=rows, autoreset_mode="Disabled", info="none", **chosen)
 
 
 def returns(shares, first):

@@ -290,12 +290,26 @@ def test_every_example_has_a_picture_that_is_there(monkeypatch: pytest.MonkeyPat
     assert {path.stem for path in (ROOT / "docs" / "examples").glob("*.png")} == names
 
 
-def test_every_task_has_its_returns() -> None:
-    """Of no command, IDM, a rule and an agent, who does best of all where the page says so."""
-    lines = (ROOT / "docs" / "returns.csv").read_text(encoding="utf-8").splitlines()
-    rows = {(task, policy): float(mean) for task, policy, mean, *_ in (line.split(",") for line in lines[1:])}
-    assert {task for task, _ in rows} == set(TASKS)
-    for task in TASKS:
-        assert {policy for name, policy in rows if name == task} == {"zero action", "IDM", "best rule", "best agent"}
-    for task in ("ring", "follow", "platoon", "replay", "replay_lanes", "highway"):
-        assert rows[task, "best agent"] == max(mean for (name, _), mean in rows.items() if name == task)
+def test_no_generated_table_has_an_empty_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of tasks, features and commands: every keyword, term and option has a default and a meaning."""
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    made = importlib.import_module("made_from_code")
+    pages = {**made.environments(), "features.md": made.features(), "commands.md": made.commands()}
+    empty = []
+    for name, text in pages.items():
+        below = False
+        for line in text.splitlines():
+            below = line.startswith("|") and (below or "---" in line)
+            cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] if below else []
+            empty += [f"{name}: {line}"] if "" in cells else []
+    assert not empty, "\n".join(empty)
+
+
+def test_the_table_of_skill_is_of_one_measure() -> None:
+    """Humans are 0, and the best row of a task is 1."""
+    lines = (ROOT / "docs" / "skill.csv").read_text(encoding="utf-8").splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    assert {row[0] for row in rows} <= set(TASKS) and rows
+    for task in {row[0] for row in rows}:
+        skill = [(row[1], float(row[4])) for row in rows if row[0] == task]
+        assert dict(skill)["human"] == 0.0 and max(x for _, x in skill) == 1.0

@@ -1,0 +1,208 @@
+"""What every task teaches, by one measure: ``python -m benchmarks.tasks [ring follow …]``.
+
+*Skill* is (return − human)/(best known − human), human being ``step(None)``, and best known the best row of the table.
+Rows, all on the same 64 fresh episodes of the task with the keywords of ``GIVEN``:
+
+* *random*, *zero*, and the *constant* that is best of 13 accelerations on other episodes;
+* *rule*: IDM's formula as commands, its six numbers the best of a cross-entropy search that sees only returns;
+* *PPO*: Stable-Baselines3's, ten lines as in README, five seeds, each its last policy.
+
+Beside each its CPU seconds of one thread, crashes, and the 95 % interval of the paired difference over episodes. A
+*first task* has zero, constants and random at most at 0.3, and PPO at least at 0.7 with 4 of 5 seeds in 120 CPU s.
+A row that is done is kept in ``--out``; ``docs/skill.csv`` has them all.
+"""
+
+from __future__ import annotations
+
+import csv
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+import tyro
+
+import idm_env  # noqa: F401 (registers the environments)
+from benchmarks import command, named_rows, table
+from idm_env.jobs.progress import OnProgress
+from idm_env.jobs.workers import HERE, Workers
+from idm_env.tasks import TASKS
+
+ROOT = Path(__file__).resolve().parents[1]
+EPISODES, FRESH, OTHERS = 64, 1 << 20, 1 << 19
+"""Episodes that judge, their first seed, and that of episodes which choose constants and rules."""
+CONSTANTS = (-0.3, -0.1, -0.03, -0.01, -0.003, 0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
+GIVEN: dict[str, dict[str, Any]] = {
+    "ring": {"hold": 1.0}, "follow": {"hold": 0.5}, "platoon": {"hold": 1.0},
+    "highway": {"hold": 1.0, "warmup": 100}, "replay": {"hold": 0.5}, "replay_lanes": {"hold": 0.5},
+}  # fmt: skip
+"""Keywords of each task here: agents decide at most twice a second."""
+TRAINING: dict[str, dict[str, Any]] = {"ring": {"warmup_pool": 256}}
+"""Keywords of training alone: episodes begin in one of so many worlds."""
+STEPS = {"ring": 250_000, "follow": 200_000, "platoon": 150_000, "highway": 200_000}
+"""Steps of PPO; of others 100 000."""
+SEEN = {"features": ["speed", "lead_speed", "gap"], "scaling": "raw"}
+GENERATIONS, RULES = 8, 16
+RANGES = ((2.5, 40.0), (0.1, 3.0), (0.3, 6.0), (0.3, 3.0), (0.5, 4.0), (0.005, 1.0))
+"""Where rules are looked for: v0 (m/s), T (s), s0 (m), a, b (m/s²), and the share of IDM's acceleration."""
+
+Act = Callable[[np.ndarray], np.ndarray]
+
+
+def returns(task: str, act: Act | None, seeds: Sequence[int], **more: Any) -> tuple[np.ndarray, int]:
+    """Return what one episode of each seed returns, and how many of them crash; ``act`` None is human driving."""
+    env = gymnasium.make_vec("DiffIDM-v0", num_envs=len(seeds), task=task, info="none", **GIVEN.get(task, {}), **more)
+    seen, _ = env.reset(seed=list(seeds))
+    total, going, crashes = np.zeros(len(seeds)), np.ones(len(seeds), bool), 0
+    while going.any():
+        seen, reward, terminated, truncated, _ = env.step(None if act is None else act(seen))
+        total += np.where(going, reward, 0.0)
+        crashes += int((going & terminated).sum())
+        going &= ~(terminated | truncated)
+    return total, crashes
+
+
+def constant(task: str) -> Act:
+    """Return the best of ``CONSTANTS``."""
+    best = max(CONSTANTS, key=lambda x: returns(task, held(task, x), range(OTHERS, OTHERS + 16))[0].mean())
+    return held(task, best)
+
+
+def held(task: str, value: float) -> Act:
+    """Return actions that are always the same."""
+    shape = gymnasium.make("DiffIDM-v0", task=task).action_space.shape
+    assert shape is not None
+    return lambda seen: np.full((len(seen), *shape), value, np.float32)
+
+
+def random(task: str) -> Act:
+    """Return actions drawn evenly."""
+    shape, drawing = held(task, 0.0)(np.zeros((1, 1))).shape[1:], np.random.default_rng(0)
+    return lambda seen: drawing.uniform(-1.0, 1.0, (len(seen), *shape)).astype(np.float32)
+
+
+def rule(task: str, values: np.ndarray) -> Act:
+    """Return actions of IDM's formula, a row of ``values`` for each environment or one for all, times a share."""
+    v0, headway, s0, a, b, share = np.atleast_2d(values)[:, None].transpose(2, 0, 1)
+    low, high = gymnasium.make("DiffIDM-v0", task=task).unwrapped.task.command_limits  # type: ignore[attr-defined]
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        speed, lead, gap = np.moveaxis(seen.reshape(len(seen), -1, 3), -1, 0)
+        wish = s0 + (speed * headway + speed * (speed - lead) / (2.0 * np.sqrt(a * b))).clip(0.0)
+        accel = share * a * (1.0 - (speed / v0) ** 4 - (wish / gap.clip(0.5)) ** 2)
+        return np.asarray(np.where(accel < 0.0, accel / -low, accel / high).clip(-1.0, 1.0), np.float32)
+
+    return act
+
+
+def searched(task: str) -> Act:
+    """Return the rule with the best mean return, by the cross-entropy method over the logarithms of its numbers."""
+    drawing = np.random.default_rng(0)
+    low, high = np.log(RANGES).T
+    middle, spread = (low + high) / 2.0, (high - low) / 2.0
+
+    def paid(rules: np.ndarray, first: int, episodes: int) -> np.ndarray:
+        act = rule(task, np.exp(rules).repeat(episodes, 0))
+        pays, _ = returns(task, act, [*range(first, first + episodes)] * len(rules), observation=SEEN)
+        return pays.reshape(len(rules), -1).mean(1)
+
+    for generation in range(GENERATIONS):
+        rules = (middle + spread * drawing.standard_normal((RULES, len(RANGES)))).clip(low, high)
+        rules[0] = middle
+        best = rules[np.argsort(paid(rules, OTHERS + 100 + 4 * generation, 4))[-RULES // 4 :]]
+        middle, spread = best.mean(0), best.std(0) + 0.05 * (high - low)
+    best = np.concatenate((best, middle[None]))
+    return rule(task, np.exp(best[int(paid(best, OTHERS + 200, 16).argmax())]))
+
+
+def ppo(task: str, seed: int) -> Act:
+    """Return the last policy of Stable-Baselines3's PPO, by the lines of README."""
+    from stable_baselines3 import PPO
+
+    from idm_env.envs.sb3 import SB3VecEnv
+
+    keywords = {**GIVEN.get(task, {}), **TRAINING.get(task, {})}
+    env = SB3VecEnv(gymnasium.make_vec("DiffIDM-v0", num_envs=32, task=task, **keywords))
+    model = PPO("MlpPolicy", env, n_steps=128, batch_size=512, learning_rate=lambda left: 6e-4 * left, seed=seed)
+    model.learn(STEPS.get(task, 100_000))
+    return lambda seen: np.asarray(model.predict(seen, deterministic=True)[0])
+
+
+@dataclass(frozen=True)
+class Part:
+    """A row of the table of a task."""
+
+    task: str
+    row: str
+    seed: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.task}, {self.row}, {self.seed}"
+
+
+def row_of(part: Part, on_progress: OnProgress) -> dict[str, Any]:
+    """Return the returns of a row, its crashes, and the CPU seconds that it took to find."""
+    torch.set_num_threads(1)
+    begin = time.process_time()
+    makers: dict[str, Callable[[], Act | None]] = {
+        "human": lambda: None, "zero": lambda: held(part.task, 0.0), "random": lambda: random(part.task),
+        "constant": lambda: constant(part.task), "rule": lambda: searched(part.task),
+        "PPO": lambda: ppo(part.task, part.seed),
+    }  # fmt: skip
+    act = makers[part.row]()
+    spent = time.process_time() - begin
+    more = {"observation": SEEN} if part.row == "rule" else {}
+    totals, crashes = returns(part.task, act, range(FRESH, FRESH + EPISODES), **more)
+    return {"seconds": spent, "returns": totals.tolist(), "crashes": crashes}
+
+
+def skills(rows: dict[Part, dict[str, Any]]) -> list[list[str]]:
+    """Return the lines of one task's table: row, seed, return, skill and its interval, crashes, CPU seconds."""
+    human = np.array(next(x["returns"] for part, x in rows.items() if part.row == "human"))
+    best = max(float(np.mean(x["returns"])) for x in rows.values()) - human.mean()
+    lines = []
+    for part, row in rows.items():
+        more = (np.array(row["returns"]) - human) / best
+        half = 1.96 * float(more.std(ddof=1)) / len(more) ** 0.5
+        numbers = f"{np.mean(row['returns']):.1f}", f"{more.mean():.2f}", f"{half:.2f}"
+        crashes, spent = f"{row['crashes']}/{len(more)}", f"{row['seconds']:.0f}"
+        lines.append([part.task, part.row, str(part.seed), *numbers, crashes, spent])
+    return lines
+
+
+def main(
+    tasks: tyro.conf.Positional[Sequence[str]] = (), rows: Sequence[str] = ("PPO", "rule"), seeds: int = 5,
+    out: Path = Path("runs/tasks.jsonl"), place: Workers = HERE,
+) -> None:  # fmt: skip
+    """Print the table of each task, and keep it in docs/skill.csv.
+
+    Args:
+        tasks: All if none is named.
+        rows: Beside those that cost nothing: PPO, rule.
+        seeds: Of PPO.
+        out: File of rows.
+        place: Where rows are worked out.
+    """
+    file, head = ROOT / "docs" / "skill.csv", ["task", "row", "seed", "return", "skill", "±", "crashes", "CPU s"]
+    for task in tasks or TASKS:
+        parts = [Part(task, row) for row in ("human", "random", "zero", "constant", *(x for x in rows if x != "PPO"))]
+        parts += [Part(task, "PPO", seed) for seed in range(seeds if "PPO" in rows else 0)]
+        done = named_rows(row_of, {str(part): part for part in parts}, out, place)
+        lines = skills({part: done[str(part)] for part in parts})
+        print(table(head, lines))
+        learnt = [float(line[4]) for line in lines if line[1] == "PPO"]
+        if learnt:
+            print(f"PPO: median {statistics.median(learnt):.2f}, at least 0.7 with {sum(x >= 0.7 for x in learnt)}\n")
+        old = list(csv.reader(file.open(encoding="utf-8")))[1:] if file.exists() else []
+        every = sorted([x for x in old if x[0] != task] + lines, key=lambda x: list(TASKS).index(x[0]))
+        with file.open("w", encoding="utf-8", newline="") as out_file:
+            csv.writer(out_file, lineterminator="\n").writerows([head, *every])
+
+
+if __name__ == "__main__":
+    command(main)
