@@ -348,7 +348,7 @@ class RowFunction:
             return self._added(args, to)
         if name == "gather":
             return self._gathered(args, shape, to)
-        if name in ("scatter", "scatter_add"):
+        if name in ("scatter", "scatter_add", "scatter_reduce"):
             return self._scattered(name, args, kwargs, shape, to)
         if name == "copy":
             name, args = "clone", args[1:]
@@ -383,6 +383,16 @@ class RowFunction:
             return self._each(
                 to, shape, lambda cell: self._at(args[0], [m.format(j) for m, j in zip(mirrored, cell, strict=True)])
             )
+        if name == "roll":
+            by = {d % x.dim() - 1: shift for shift, d in zip(args[1], args[2], strict=True)}
+            if -1 in by or not by:
+                raise Untraceable("roll mixes rows")
+            shifted = [f"(({{}} + {-by[k] % n}) % {n})" if k in by else "{}" for k, n in enumerate(shape)]
+            return self._each(
+                to, shape, lambda cell: self._at(args[0], [m.format(j) for m, j in zip(shifted, cell, strict=True)])
+            )
+        if name == "searchsorted":
+            return self._searched(args, kwargs, x, to)
         if name == "cumsum":
             return self._cumsum(args, x, to)
         if name in ("index", "index_select"):
@@ -527,22 +537,37 @@ class RowFunction:
     def _scattered(
         self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], shape: tuple[int, ...], to: Place
     ) -> list[str]:  # fmt: skip
-        """Print ``x.scatter(dim, which, source)``, or with what was there added to it."""
+        """Print ``x.scatter(dim, which, source)``, or with what was there added to it, or the larger or smaller one."""
         x, dim, which, source = args[:4]
         along = dim % x.dim() - 1
-        if along < 0 or len(args) > 4 or kwargs:
-            raise Untraceable(f"{name} of rows, or with a reduction")
+        form = {"scatter": "{1}", "scatter_add": "{0} + {1}"}.get(name) or REDUCE.get(str(args[-1]), ("", ""))[1]
+        if along < 0 or kwargs or not form or (len(args) > 4) != (name == "scatter_reduce"):
+            raise Untraceable(f"{name} of rows, or with another reduction")
 
         def line(cell: list[str]) -> list[str]:
             target = index(to, ["k" if d == along else i for d, i in enumerate(cell)])
-            value = self._at(source, cell, to.kind)
-            return [
-                f"k = {self._at(which, cell)}",
-                f"{target} = {value if name == 'scatter' else f'{target} + {value}'}",
-            ]
+            value = form.format(target, self._at(source, cell, to.kind))
+            return [f"k = {self._at(which, cell)}", f"{target} = {value}"]
 
         first = self._each(to, shape, lambda cell: self._at(x, cell, to.kind))
         return [*first, *self._loops(which.shape[1:], line)]
+
+    def _searched(self, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
+        """Print ``torch.searchsorted(keys, values)``: by halves."""
+        keys, values = args[:2]
+        if len(args) > 2 or set(kwargs) - {"right"} or keys.dim() != values.dim():
+            raise Untraceable("searchsorted that is not of every row's own keys")
+        form = COMPARE["le" if kwargs.get("right") else "lt"]
+
+        def line(cell: list[str]) -> list[str]:
+            kind = self._common(args)
+            before = form.format(self._at(keys, [*cell[:-1], "k"], kind), self._at(values, cell, kind))
+            return [
+                "n = 0", f"h = {keys.shape[-1]}", "while n < h:", "    k = (n + h) // 2",
+                f"    n = k + 1 if {before} else n", f"    h = h if {before} else k", f"{index(to, cell)} = n",
+            ]  # fmt: skip
+
+        return self._loops(x.shape[1:], line)
 
     def _sorted(self, args: Sequence[Any], kwargs: Mapping[str, Any], out: Sequence[Tensor]) -> list[str]:
         """Print the first of ``x.sort(stable=True)``, as many as are read: of equals the one that came first."""

@@ -1,0 +1,79 @@
+"""What rows record is what torch does: single operations, and a whole step on several lanes."""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("numba")
+
+from idm_env import IDM, Lanes, Simulator
+from idm_env.effects import Mobil, make
+from idm_env.envs.plan import examples_of, named, world_of
+from idm_env.kernels.rows import RowFunction
+from idm_env.multilane.demand import trips, waiting
+from idm_env.roads.layout import lane_drop
+from idm_env.tasks import EnvState
+
+ROWS, MANY = 3, 1009
+
+
+def called(loops, arrays):
+    """Return the outputs of some rows."""
+    out = {n: np.empty((ROWS, *shape), loops.types[n]) for n, shape in loops.shapes.items()}
+    table = loops.table(arrays | out)
+    ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)(loops.call)(0, ROWS, table.ctypes.data)
+    return out
+
+
+def test_searches_rolls_and_reductions_by_index():
+    def function(keys, values, slots):
+        here = torch.searchsorted(keys, values), torch.searchsorted(keys, values, right=True)
+        least = torch.full_like(values, 9.0).scatter_reduce(-1, slots, values, "amin")
+        most = slots.new_full(slots.shape, -9).scatter_reduce(-1, slots, here[0], "amax")
+        rolled = values.roll(1, -1), values.roll(-2, -1)
+        return dict(zip("abcdef", (*here, least, most, *rolled), strict=True))
+
+    def inputs(rows):
+        draw = torch.Generator().manual_seed(3)
+        keys = torch.randint(0, 6, (rows, 7), generator=draw).double().sort().values  # with equal ones among them
+        values = torch.randint(-1, 7, (rows, 5), generator=draw).double()
+        return {"keys": keys, "values": values, "slots": torch.randint(0, 5, (rows, 5), generator=draw)}
+
+    given = inputs(ROWS)
+    out = called(RowFunction(function, inputs(MANY), MANY), {n: x.numpy() for n, x in given.items()})
+    for name, x in function(**given).items():
+        assert np.array_equal(out[name], x.numpy()), name
+
+
+def test_a_whole_step_on_several_lanes_is_one_function_of_rows():
+    """Vehicles enter, change lanes and leave; a recording asks nobody whether they do."""
+    road = Lanes(2, length=150.0, ends=(lane_drop(0, at=110.0),))
+    simulator = Simulator(road, (IDM(), make("mandatory_change"), Mobil(every=0.5)), dt=0.5)
+    params = simulator.defaults(dtype=torch.float64)
+    schedule = trips({0: 1500.0, 1: 900.0}, 12.0, slots=6, dtype=torch.float64)
+    schedule = type(schedule)(*(x.expand(ROWS, -1).contiguous() for x in schedule))
+    state = waiting(simulator, schedule, params)
+    speeds = torch.linspace(14.0, 20.0, ROWS, dtype=torch.float64).unsqueeze(-1)
+    assert state.lanes is not None
+    state = state._replace(
+        step=torch.zeros(ROWS, dtype=torch.int64), length=torch.full_like(state.speed, 5.0),
+        lanes=state.lanes._replace(trips=schedule._replace(speed=speeds.expand(schedule.speed.shape).contiguous())),
+    )  # fmt: skip
+    world = EnvState(state, {})
+
+    def step(**leaves):
+        after = EnvState(simulator.step(world_of(leaves, world).state, {}, params), {})
+        return {f"then_{n}": x for n, x in named(after).items()}
+
+    loops = RowFunction(step, examples_of(world, MANY), MANY, apart=True)
+    leaves = {n: x.contiguous() for n, x in named(world).items()}
+    for _ in range(40):
+        out, after = called(loops, {n: x.numpy() for n, x in leaves.items()}), step(**leaves)
+        for name, x in after.items():
+            assert np.array_equal(out[name].reshape(x.shape), x.numpy()), name
+        leaves = {n: after[f"then_{n}"].contiguous() for n in leaves}
+    assert all(int(leaves[n].sum()) > ROWS for n in ("links_changed", "trips_entered", "trips_left"))
