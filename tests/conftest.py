@@ -13,9 +13,13 @@ from hypothesis import HealthCheck, settings
 
 from idm_env.effects import ALL
 
-# Examples take as long as the machine is busy; fixtures that examples share hold nothing that one of them changes.
+# Examples are as many as a suite of minutes allows, and take as long as the machine is busy; fixtures that they share
+# hold nothing that one of them changes.
 settings.register_profile(
-    "suite", deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
+    "suite",
+    max_examples=40,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 settings.load_profile("suite")
 

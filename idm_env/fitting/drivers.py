@@ -55,15 +55,6 @@ class Estimates:
         return torch.stack(rows), [name for name in groups if name not in index]
 
     @classmethod
-    def from_fit(cls, result: Fit) -> Estimates:
-        """Return what one fit found."""
-        problem, errors = result.problem, result.uncertainty
-        return cls(
-            problem.simulator, problem.batch.dt, problem.fixed, result.names, problem.groups, result.values(),
-            errors.standard_error, errors.at_bound, errors.identified,
-        )  # fmt: skip
-
-    @classmethod
     def joined(cls, table: pl.DataFrame, simulator: Simulator, dt: float, fixed: Mapping[str, float]) -> Estimates:
         """Return what several fits found, from the rows of their ``Fit.table()``."""
         names = tuple(table["parameter"].unique(maintain_order=True))
