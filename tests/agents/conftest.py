@@ -13,7 +13,7 @@ from agents.monitor import make_logger
 
 RING: dict[str, Any] = {
     "task": "ring", "vehicles": 8, "length": [60.0, 75.0], "warmup": 20, "warmup_pool": 8, "reward": "flow",
-    "tailgating": 5.0, "max_episode_steps": 60,
+    "tailgating": 5.0, "shock": 0.0, "max_episode_steps": 60,
 }  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from agents.rollout import Driven, drive, ring_start, uniform_speed
 from idm_env.effects.idm import equilibrium_speed
 from idm_env.tasks import make_task
 
-RING: dict[str, Any] = {"task": "ring"}
+RING: dict[str, Any] = {"task": "ring", "shock": 0.0}
 TASK = make_task(**RING)
 
 
@@ -192,12 +192,15 @@ def test_a_task_without_a_test_is_told():
 
 def test_agents_are_judged_with_a_shock_that_training_does_not_have():
     guarded = {**RING, "failsafe": 3.0}
-    assert evaluate.as_judged(guarded) == {**guarded, "shock": 4.0}
+    assert evaluate.as_judged(guarded) == {**guarded, "shock": 4.0, "shock_after": 120.0}
     assert evaluate.as_judged({"warmup": 5, "parameters": {"idm.max_accel": 0.8}}, {"parameters": {}}) == {
-        "warmup": 5, "parameters": {}, "shock": 4.0,
+        "warmup": 5, "parameters": {}, "shock": 4.0, "shock_after": 120.0,
     }  # fmt: skip
-    assert evaluate.as_judged({"task": "follow"}) == {"task": "follow"}
-    calm, shocked = (evaluate.evaluate_ring(no_command, {**guarded, "shock": x}, (260.0,), 750) for x in (0.0, 4.0))
+    assert evaluate.as_judged({"task": "follow"}) == {"task": "follow", "reward": "source"}
+    calm, shocked = (
+        evaluate.evaluate_ring(no_command, {**guarded, "shock": x, "shock_after": 120.0}, (260.0,), 750)
+        for x in (0.0, 4.0)
+    )
     assert calm["passed"] and not shocked["passed"]
 
 

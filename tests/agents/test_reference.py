@@ -13,7 +13,7 @@ from agents.evaluate import SPEED_RATIO, as_judged, evaluate_ring
 from agents.policy import Policy
 from agents.rollout import ring_start
 
-GUARDED: dict[str, Any] = {"task": "ring", "failsafe": 3.0}
+GUARDED: dict[str, Any] = {"task": "ring", "failsafe": 3.0, "shock": 0.0}
 SHOCK = as_judged(GUARDED)
 
 
@@ -45,6 +45,14 @@ def test_an_oracle_can_pass_it():
     patient = family.names.index("0.05 (1 U − v)")
     for draws in ((0,), (1, 2, 3, 4, 5)):
         assert reference.judge(family, SHOCK, draws, (patient,))[0]["passed"]
+
+
+def test_one_line_passes_the_ring_and_fails_the_long_one():
+    """Of a searched family; on a ring of 44 one vehicle has twice as many humans to calm."""
+    for environment, passes in ((SHOCK, True), ({**SHOCK, "vehicles": 44, "length": [440.0, 540.0]}, False)):
+        family = reference.families(environment)["one line of a gap"]()
+        line = family.names.index("0.002 s⁻² (s − 4 m)")
+        assert reference.judge(family, environment, (0,), (line,))[0]["passed"] is passes
 
 
 def test_policies_that_drive_together_do_what_each_does_alone(monkeypatch):
