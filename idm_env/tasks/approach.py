@@ -53,7 +53,7 @@ def _until(view: AgentView) -> Tensor:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ApproachTask(OpenLanesTask):
-    """The last 500 m before a signal with a fixed cycle, and 100 m behind it; a third of the vehicles are agents.
+    """A demonstration: the last 500 m before a signal with a fixed cycle, where a third of the vehicles are agents.
 
     Vehicles come in platoons, as from a signal upstream with the same cycle. Episodes begin at any phase of it. After
     the tasks of eco-driving at signals of IntersectionZoo (Jayawardana et al. 2024, arXiv 2410.15221), on one approach.

@@ -24,7 +24,7 @@ _PLACE_STREAM = 31
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HighwayTask(LanesTask):
-    """A ring of lanes: agents accelerate, their drivers change lanes by MOBIL, or they do with ``lane_commands=True``.
+    """A demonstration: on a ring of lanes agents accelerate; lanes change by MOBIL, or by ``lane_commands=True``.
 
     After ``highway-v0`` of HighwayEnv (Leurent 2018, https://github.com/Farama-Foundation/HighwayEnv), on a ring, so
     that traffic stays as dense as it begins. Desired speeds differ between drivers by up to ``spread`` either way.

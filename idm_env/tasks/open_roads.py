@@ -19,7 +19,7 @@ from idm_env.tasks.trip_table import SECOND, spread
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OpenHighwayTask(OpenLanesTask):
-    """Several lanes, none of which ends: ``highway`` with vehicles that come and go, as in HighwayEnv's.
+    """A demonstration: several lanes, none of which ends, with vehicles that come and go as in HighwayEnv's.
 
     With a ramp lane 0 is that of the ramps, and the others are the road's. The on-ramp begins 300 m before one may
     leave it, and ends where one may not; the off-ramp is left 200 m behind that.
@@ -130,7 +130,7 @@ class OpenHighwayTask(OpenLanesTask):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MergeTask(OpenLanesTask):
-    """Two lanes, and a ramp on their right from which one must merge within 200 m; it begins at 100 m.
+    """A demonstration: two lanes, and a ramp on their right from which one must merge within 200 m; it begins at 100 m.
 
     Args:
         inflow: Vehicles an hour on the two lanes together.
@@ -169,7 +169,7 @@ class MergeTask(OpenLanesTask):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BottleneckTask(OpenLanesTask):
-    """Four lanes, of which the outer two end at 400 m and the left one of the others at 600 m: 4 → 2 → 1.
+    """A demonstration: four lanes; the outer two end at 400 m, the left one of the others at 600 m: 4 → 2 → 1.
 
     After the bottleneck of Flow (Vinitsky et al. 2018, CoRL, "Benchmarks for reinforcement learning in mixed-autonomy
     traffic").

@@ -27,7 +27,7 @@ FIRST_LANES = ("left", "right")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReplayLanesTask(ReplayTask, LanesTask):
-    """One run of a file with lane numbers: every vehicle where its smoothed record says; some are simulated instead.
+    """A demonstration: one run of a file with lanes, its vehicles where their records say, or simulated instead.
 
     Recorded vehicles enter, leave and change lanes as recorded, and do not react to those that are handed over, who
     follow whoever is ahead of them on their lane, at every step. Which vehicles agents control, where episodes begin,
