@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.delay_buffer import PAST
 from idm_env.envs.plan import (
     Array,
     Bound,
@@ -281,10 +282,10 @@ class LanePlan(Plan):
         simulator, self.road = moves.task.simulator, moves.task.simulator.road
         if self.road.duration:
             raise Untraceable("compiled changes take no time, and Lanes has a duration")
+        if PAST in world.state.memory:
+            raise Untraceable("an effect looks back, where vehicles change lanes")
         self.ring = float(self.road.ring or 0.0)
         super().__init__(moves, world, layout, kind, draws)
-        if self.kernel.signals:
-            raise Untraceable("an effect looks back, where vehicles change lanes")
         recorded, like = self.recorded, world.state
         self.like, self._drawn_by = np.empty(0, self.real), self.pitch
         self.coming = like.present is not None

@@ -218,3 +218,11 @@ def test_several_lanes_are_compiled_from_the_first_step():
         for told in zip(ours.step(action)[:4], theirs.step(action)[:4], strict=True):
             _same(*told)
         assert ours.unwrapped.batch._loaded
+
+
+def test_what_several_lanes_do_not_compile_is_said_with_its_reason():
+    """At the first step, in one line."""
+    env = gym.make("DiffIDM-v0", task="highway", vehicles=8, hold=0.1, effects=["delay"])
+    env.reset(seed=1)
+    with pytest.warns(UserWarning, match="torch path runs instead: an effect looks back, where vehicles change lanes"):
+        env.step(None)
