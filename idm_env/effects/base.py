@@ -75,8 +75,7 @@ class Effect:
     ``acts_on``     what it changes: an acceleration, a parameter of the driver, a perceived signal, the response
     ``beyond``      whom the record must show
     ``takes``       the type of what it takes from outside at every step (``scene.input``), if anything
-    ``wind_up_s``   seconds of the record that it needs before a prediction begins; all of it, for one that remembers,
-                    where nothing is said
+    ``wind_up_s``   spin-up time (s) before a prediction; default 0.1 s, the whole record for effects with memory
     ``per_driver``  whether its strengths, all above 0, may be each driver's own, with a population
     ``column``      column of a file that gives its ``profile``, if measured
     ==============  ====================================================================================================

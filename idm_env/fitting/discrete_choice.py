@@ -55,7 +55,7 @@ class Choice(abc.ABC):
     @property
     @abc.abstractmethod
     def parameters(self) -> tuple[Parameter, ...]:
-        """What is fitted, with units and bounds."""
+        """Free parameters, with units and bounds."""
 
     @abc.abstractmethod
     def values(self, theta: Tensor, decisions: Decisions) -> Tensor:

@@ -41,7 +41,7 @@ class Estimates:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Declarations of what was fitted."""
+        """Declarations of the fitted parameters."""
         declared = catalogue(self.simulator.effects)
         return tuple(declared[name] for name in self.names)
 

@@ -61,7 +61,7 @@ class Fit:
 
 
 def base_simulator(dt: float = 0.1, base: CarFollowing | None = None, **choices: Any) -> Simulator:
-    """Return what is calibrated: a car-following law (IDM) and brakes in a lane behind replayed neighbours."""
+    """Return the simulator to calibrate: a car-following law (IDM) and brakes in a lane behind replayed neighbours."""
     return Simulator(Lane(), (base or IDM(), Replay(), Brakes()), dt=dt, **choices)
 
 

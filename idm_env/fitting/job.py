@@ -67,7 +67,7 @@ def fit_file(
 
 
 class _Work(NamedTuple):
-    """What one call of ``fit_file`` was asked for."""
+    """Arguments of one call of ``fit_file``."""
 
     source: Source
     options: Options
@@ -90,7 +90,7 @@ class _Work(NamedTuple):
         )
 
     def fit(self, data: Sequence[Sequence[Episode] | FolderSlice], by: str, name: str, before: str = "") -> JoinedFit:
-        """Fit all parts and return what they found."""
+        """Fit all parts and return their results."""
         cut = self.pieces(data, by, name)
         parts = cut[0].parts
         try:

@@ -43,7 +43,7 @@ FEW = 30
 
 @dataclass(frozen=True)
 class ChangeOptions:
-    """What lane changes are fitted with.
+    """Options of a fit of lane changes.
 
     ``model`` is a saved model, whose car-following law (and other effects) judge the hypothetical pairs; without it
     ``base`` does with its defaults. ``every`` (s), ``ahead`` (s) and ``first_lane`` are those of
@@ -198,7 +198,7 @@ def _result(fit: LaneChanges, trajectories: Trajectories, options: ChangeOptions
 
 
 def _sentence(fit: LaneChanges, compared: list[dict[str, Any]]) -> str:
-    """Return what was found, in words that follow the figures."""
+    """Return the finding in a sentence that follows the figures."""
     decisions = fit.decisions
     verdicts = []
     for row in compared[1:]:

@@ -26,7 +26,7 @@ ROWS = 400_000
 
 @dataclass(frozen=True)
 class Decisions:
-    """What N drivers could do, and did, at recorded states: the scene and all else are [N].
+    """Choices of N drivers at recorded states, and their alternatives: the scene and all else are [N].
 
     ``scene`` has ``here``, ``left`` and ``right``, hypothetical accelerations answered by the simulator's own effects;
     ``params`` are the parameters of the driver who decides. ``possible`` [N, 2] is where there is a lane and room to

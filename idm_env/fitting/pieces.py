@@ -147,7 +147,7 @@ class JoinedFit:
 
 
 def join(parts: Parts, options: Options) -> JoinedFit:
-    """Return what the pieces found. DataError if none found anything."""
+    """Return the joined results of the pieces. DataError if none has any."""
     summaries = parts.summaries()
     good = [summary for summary in summaries if "lost" not in summary]
     if not good:

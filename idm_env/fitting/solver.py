@@ -50,7 +50,7 @@ class Box(NamedTuple):
 
 
 class Known(Protocol):
-    """What is known of own parameters beforehand."""
+    """Prior of the own parameters."""
 
     def equations(self, own: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return what it adds to cost [..., G], gradient [..., G, P] and Gauss–Newton matrix; own [..., G, P]."""
@@ -60,7 +60,7 @@ class Known(Protocol):
 
 
 class LeastSquares(Protocol):
-    """What the solver asks of a problem; S are copies, starts or trials side by side."""
+    """Problem of nonlinear least squares; S are copies, starts or trials side by side."""
 
     @property
     def boxes(self) -> tuple[Box, Box]:
@@ -68,7 +68,7 @@ class LeastSquares(Protocol):
 
     @property
     def prior(self) -> Known | None:
-        """What is known of the own parameters."""
+        """Prior of the own parameters."""
 
     @property
     def stiffness(self) -> Tensor:

@@ -52,7 +52,7 @@ class Parts:
         self.store.put_json(f"{number:06d}", {"summary": storage.plain(summary), "tables": tables})
 
     def summaries(self) -> list[dict[str, Any]]:
-        """Return what is remembered of all parts, in their order."""
+        """Return the summaries of all parts, in their order."""
         return [self.store.get_json(key)["summary"] for key in self.store.kept()]
 
     def tables(self, name: str) -> list[Path]:

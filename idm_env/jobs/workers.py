@@ -27,7 +27,7 @@ class Workers:
     ray_address: str | None = None
 
     def opened(self) -> AbstractContextManager[Executor]:
-        """Return whoever does the parts, for a ``with``."""
+        """Return the executor of the parts, for a ``with``."""
         from idm_env.jobs.executor import opened
 
         return opened(self.executor, self.jobs, self.ray_address)

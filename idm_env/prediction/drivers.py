@@ -100,7 +100,7 @@ def quantiles(count: int, dimensions: int = 10) -> np.ndarray:
 
 
 def hypotheses(second: Second) -> list[DriverHypothesis]:
-    """Return what the driver may be up to on this route; the shares sum to 1."""
+    """Return the hypotheses of a driver on this route; their shares sum to 1."""
     route, speed = second.route, float(second.speeds[-1])
     limit = route.limit if np.isfinite(route.limit) else URBAN_LIMIT
     bends = bend_speed(route, np.array([LATERAL_MPS2]), np.array([CENTRE["comfort_decel"]]))[0]

@@ -75,7 +75,7 @@ class MapScene:
         return [route for route in routes if route.weight >= LEAST_ROUTE * routes[0].weight]
 
     def leader(self, index: int, route: Route) -> tuple[int, float, float] | None:
-        """Return who is next ahead on a route, arc length and lateral distance of its centre (m), or None.
+        """Return the next vehicle ahead on a route, arc length and lateral distance of its centre (m), or None.
 
         Ahead is whose body reaches into the width of one's own, is not beside one, and does not cross the route.
         """

@@ -268,7 +268,7 @@ def less(name: str, offset: float, unit: str) -> str:
 
 
 def place_label(ring_length: float | None) -> str:
-    """Return what the axis of positions is called."""
+    """Return the label of the position axis."""
     return "position (m)" if ring_length is None else "position on the ring (m)"
 
 

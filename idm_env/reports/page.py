@@ -125,7 +125,7 @@ def lights(rows: Iterable[tuple[str, str, str]]) -> Block:
 
 
 def terms(meanings: Mapping[str, str]) -> Block:
-    """Return what the terms of a table mean, to stand under it."""
+    """Return the meanings of a table's terms, to stand under it."""
     return Block("terms", rows=tuple(meanings.items()))
 
 

@@ -169,12 +169,12 @@ class DriverProgram:
 
     @cached_property
     def constants(self) -> tuple[Leaf, ...]:
-        """What holds for a whole rollout and is no parameter."""
+        """Constants of a whole rollout that are no parameters."""
         return tuple(s for s in self.slots if s.name in FIXED_IN_TIME)
 
     @cached_property
     def records(self) -> tuple[Leaf, ...]:
-        """What a record or an input gives at every step."""
+        """Values of records and inputs at every step."""
         others = [s for s in self.slots if not self._is_state(s) and s not in self.constants]
         return tuple(s for s in others if "." not in s.name and not s.name.startswith("past "))
 

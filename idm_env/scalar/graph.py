@@ -84,7 +84,7 @@ class Graph:
         return self.node("constant", label=value if isinstance(value, float) else float(value))
 
     def input(self, name: str, shift: int = 0, level: int = DYNAMIC) -> Node:
-        """Return what is read under a name."""
+        """Return the node of an input by name."""
         return self.node("input", label=Leaf(name, shift), level=level)
 
     # -- arithmetic ----------------------------------------------------------------------------------------------

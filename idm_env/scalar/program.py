@@ -109,11 +109,11 @@ class Program:
         return tuple(f"hoisted{i}" for i in range(len(self.hoist)))
 
     def outputs(self, phase: str) -> list[Node]:
-        """Return what a phase computes."""
+        """Return the results of a phase."""
         return list(self.named(phase).values())
 
     def named(self, phase: str) -> dict[str, Node]:
-        """Return what a phase computes, by name."""
+        """Return the results of a phase, by name."""
         return {
             "sense": {f"signal {i}": node for i, node in enumerate(self.sense)},
             "recall": {f"ago {i}": node for i, node in enumerate(self.recall)},

@@ -25,7 +25,7 @@ from idm_env.types import Motion, Scene, State
 
 @dataclass(frozen=True)
 class Form:
-    """What is given to a step beside its simulator, as far as it shapes the step: a key of what was recorded.
+    """Signature of a step: inputs (which are boolean), memories, presence. Cache key of a recording.
 
     ``inputs`` are (effect, fields given, which of them are truth values); ``memories`` are effects that have a memory.
     """

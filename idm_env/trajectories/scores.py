@@ -103,7 +103,7 @@ class Tally:
             setattr(self, name, getattr(self, name) + value)
 
     def row(self) -> dict[str, float | int]:
-        """Return the row of a report; what was not measured is absent."""
+        """Return the row of a report, without metrics that were not measured."""
         mean = self.accel / self.samples if self.samples else float("nan")
         spread = max(self.accel_square / self.samples - mean * mean, 0.0) ** 0.5 if self.samples else float("nan")
         row: dict[str, float | int] = {

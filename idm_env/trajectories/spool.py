@@ -35,7 +35,7 @@ LONGEST_STEP_S = 60.0
 
 @dataclass(frozen=True)
 class Shelf:
-    """Chunks of vehicles on disk, to be read by whoever works on them.
+    """Chunks of vehicles on disk, each read by one worker.
 
     Attributes:
         source: Name of the file.
