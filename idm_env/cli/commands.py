@@ -685,7 +685,8 @@ def run() -> None:
 
 def _failed(error: Exception) -> NoReturn:
     """End with one line that says what is wrong, never longer than a terminal can take."""
-    text = " ".join((storage.full(error) or str(error) or type(error).__name__).split())
+    reason = storage.full(error) or str(error) or type(error).__name__
+    text = " ".join(" ".join([reason, *getattr(error, "__notes__", ())]).split())
     print(f"error: {text if len(text) <= 1000 else text[:1000] + ' …'}", file=sys.stderr)
     sys.exit(1)
 

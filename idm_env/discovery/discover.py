@@ -27,6 +27,7 @@ from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import Decided, decide
 from idm_env.discovery.solve import Problem
+from idm_env.discovery.write import write_search
 from idm_env.effects import (
     ALL,
     CANDIDATES,
@@ -117,7 +118,13 @@ def discover(
         progress("other laws", *state)
 
     evaluation, decided = searched(Hypothesis(known_terms, march.Catalogue.of(extra, prepared.period, law)), "explain")
-    discovery = finished(trajectories, evaluation, decided, refused, by, on_law, searched)
+    try:
+        discovery = finished(trajectories, evaluation, decided, refused, by, on_law, searched)
+    except Exception as error:
+        if out is not None:
+            path = write_search(out, decided, prepared, by)
+            error.add_note(f"What the search saw is in {path}; with --resume it need not search again.")
+        raise
     for store in stores:
         store.remove()
     return discovery

@@ -328,6 +328,10 @@ def effects_of(model: Hypothesis, values: np.ndarray) -> tuple[list[Effect], dic
         mine = np.asarray(values[begin : begin + term.size], float)
         begin += term.size
         for effect, strengths in _effects(term, mine):
+            number = 1
+            while effect.name in numbers:  # rounds may add one quantity over one coordinate with other knots
+                number += 1
+                effect = replace(effect, number=number)  # type: ignore[call-arg] # names are twice in curves only
             effects.append(effect)
             numbers[effect.name] = strengths
     return effects, numbers

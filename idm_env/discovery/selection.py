@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import ttest_1samp
@@ -24,7 +24,7 @@ from idm_env.discovery.score import (
 )
 from idm_env.discovery.search import Scored, Search
 from idm_env.discovery.solve import Solution, solve
-from idm_env.discovery.units import smallest_p
+from idm_env.discovery.units import MANY_RUNS, smallest_p, units
 from idm_env.discovery.verdict import Reason, Refusal
 from idm_env.effects import ALL
 
@@ -61,6 +61,8 @@ class Round:
     partial: int | None = None
     in_closed_loop: bool = False
     """Whether gains are those of free simulation, and not of predictions in windows."""
+    run: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    """Run of every unit [units] that gains are of: free simulation counts followers where windows count runs."""
 
     @property
     def smooth_gain(self) -> float:
@@ -69,12 +71,12 @@ class Round:
         return max(0.0, float(self.left.mean()), *shapes)
 
     def chosen_in(self, winner: int, fold: np.ndarray) -> float:
-        """Return the share of folds without whose units it, or what is ``equivalent``, gains most; ``fold`` [units].
+        """Return the share of folds without whose runs it, or what is ``equivalent``, gains most; ``fold`` [runs].
 
         Where that is 1, the errors of cross-fitting are those of a choice made anew without every fold. A candidate of
         the catalogue goes before what is only located, as in the choice itself.
         """
-        gains = np.array([s.gains for s in self.scored])
+        gains, fold = np.array([s.gains for s in self.scored]), fold[self.run]
         named = np.array([s.term.effect is not None for s in self.scored])
         able = np.array([self.in_closed_loop or s.solution is not None for s in self.scored])
         alike = [winner, *self.equivalent]
@@ -140,7 +142,8 @@ def _joined(
         return None
     joined, forward = together.grow(searching, searching.weighed(now)[0], len(null.model.terms), seed)
     rounds += [
-        Round(s.scored, s.tested, last.before, last.left, s.winner, equivalent=s.equivalent, in_closed_loop=True)
+        Round(s.scored, s.tested, last.before, last.left, s.winner, equivalent=s.equivalent, in_closed_loop=True,
+              run=units(searching.problem.rows.records, MANY_RUNS).run)
         for s in forward if s.scored
     ]  # fmt: skip
     return joined
@@ -150,11 +153,18 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
     now = null
     steps: list[Solution] = []
     rounds: list[Round] = []
+    last: Round | None = None
     for number in range(1, MOST_ROUNDS + 2):
         if len(steps) == MOST_ROUNDS or (steps and (_is_whole(now) or _at_floor(searching, now))):
             break
         scored, before = searching.round(now, number, not steps)
         scored = [s for s in scored if not _same_class(s.term, now.model)]
+        if not scored and last is not None:
+            # The only candidate was a latency below a step, which is the null's now and leads nothing.
+            tested = replace(last.tested, p_value=np.ones(len(last.scored)))
+            rounds.append(
+                replace(last, tested=tested, winner=None, equivalent=[], partial=None, refusal=Refusal(Reason.NO_GAIN))
+            )
         if not scored and rounds:
             break
         if not scored:
@@ -168,7 +178,7 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
             now, scored = searching.again(now, scored[fitted[0]], scored)
             tested = _tested(searching, scored, seed)
         left = judge.ceiling(places.respond(searching.problem, now))
-        this = Round(scored, tested, before, left, None)
+        this = Round(scored, tested, before, left, None, run=searching.units.run)
         rounds.append(this)
         _choose(searching, now, this)
         if this.winner is None:
@@ -177,8 +187,7 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
         assert chosen is not None
         now = searching.weighed(searching.null(chosen.model, chosen.theta, chosen.values))[1]
         if not steps and _is_a_step(now, searching.problem.rows.records.dt):
-            null = now
-            rounds.pop()
+            null, last = now, rounds.pop()
         else:
             steps.append(now)
     return null, steps, rounds
@@ -232,7 +241,7 @@ def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | 
     scored = [searching.pair(now, pair, before, number) for pair in pairs]
     tested = _tested(searching, (*last.scored, *scored), seed)
     mine = Tested(*(x[len(last.scored) :] for x in (tested.p_value, tested.gain, tested.interval)))
-    this = Round(scored, mine, before, last.left, None)
+    this = Round(scored, mine, before, last.left, None, run=searching.units.run)
     _choose(searching, now, this)
     if this.winner is None:
         return None
@@ -240,7 +249,7 @@ def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | 
     assert solution is not None
     both = [Scored(term, solution, scored[this.winner].gains) for term in solution.model.terms[-2:]]
     twice = Tested(*(np.repeat(x[[this.winner]], 2, axis=0) for x in (mine.p_value, mine.gain, mine.interval)))
-    return Round(both, twice, this.before, this.left, 0, 1, share=this.share)
+    return Round(both, twice, this.before, this.left, 0, 1, share=this.share, run=this.run)
 
 
 def _same_class(term: Term, model: Hypothesis) -> bool:

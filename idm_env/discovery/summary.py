@@ -91,7 +91,7 @@ def summarise(
             None if before is None or after is None else after.summary(), floor,
         ),
         partial=None if judged.added or compared is None else _nearest(judged, nearest, first),
-        candidates=_candidates(rounds, refused),
+        candidates=candidates_of(rounds, refused),
         shared=judged.shared,
         excluded=[
             result.Excluded(name, s.parameter.name, s.parameter.unit, s.estimate, s.low, s.high, s.seen, s.typical)
@@ -247,8 +247,7 @@ def _findings(
 ) -> list[result.TermFinding]:
     """Return the terms of the model that is ``compared`` after those of the null."""
     intervals = interval_of(compared, problem) if judged.intervals is None else judged.intervals
-    counted, records = units(problem.rows.records), problem.rows.records
-    fold = crossed.folds_of(records.runs, (), judged.seed)[counted.run]
+    fold = crossed.folds_of(problem.rows.records.runs, (), judged.seed)
     law = judged.null.model.catalogue.base.title
     findings, begin = [], sum(t.size for t in judged.null.model.terms)
     for term in judged.terms:
@@ -301,7 +300,8 @@ def _known(final: Solution, intervals: np.ndarray, base: int) -> list[result.Giv
     return [result.GivenParameter(*name, estimate, low, high) for name, (estimate, low, high) in estimates]
 
 
-def _candidates(rounds: Sequence[Round], refused: dict[str, str]) -> list[result.Candidate]:
+def candidates_of(rounds: Sequence[Round], refused: dict[str, str]) -> list[result.Candidate]:
+    """Return every candidate of every round, best first, then those ``refused`` by name and why."""
     rows = [
         _candidate(number, this, int(i)) for number, this in enumerate(rounds, 1) for i in np.argsort(-this.tested.gain)
     ]

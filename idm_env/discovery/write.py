@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
-from idm_env.discovery.finish import Discovery
-from idm_env.jobs.storage import results, write_json
+from idm_env.discovery.finish import Discovery, corrected
+from idm_env.discovery.records import Records
+from idm_env.discovery.selection import Decided
+from idm_env.discovery.summary import candidates_of
+from idm_env.jobs.storage import plain, results, write_json
 from idm_env.model_file import save_model
-from idm_env.reports.undecided import EXPLAINED, FOUND
+from idm_env.reports.undecided import EXPLAINED, FOUND, SEARCH
 
 
 def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
@@ -33,3 +37,19 @@ def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
             paths[FOUND].write_text(found_effect, encoding="utf-8")
         page.write(paths["report.html"], discovery)
     return paths
+
+
+def write_search(out: Path, decided: Decided, prepared: Records, by: str) -> Path:
+    """Write what a search saw where its judgement failed; return the path of ``search.json``.
+
+    All candidates of every round, and the terms that were chosen with their values. The model that they make is
+    ``model_search.yaml``, where it can be made. What an earlier run wrote stays.
+    """
+    final = decided.steps[-1] if decided.steps else decided.null
+    values = {t.label: final.values[final.model.where(t.label)].tolist() for t in final.model.terms}
+    with results(out, EXPLAINED) as folder:
+        path = folder / SEARCH[0]
+        write_json(path, plain({"chosen": values, "candidates": candidates_of(decided.rounds, {})}))
+        with suppress(ValueError):  # that may be what failed
+            save_model(folder / SEARCH[1], corrected(prepared, final, final.theta, by))
+    return path

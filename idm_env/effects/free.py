@@ -54,6 +54,10 @@ def share_of(scene: Scene, driver: Driver, state: str) -> Tensor:
     return (feature_of(scene, driver, state, None) / PER[state]).clamp(-2.0, 2.0)
 
 
+def _ending(by: str, number: int) -> str:
+    return (f"_by_{by}" if by else "") + (f"_{number}" if number > 1 else "")
+
+
 def _check(name: str, feature: str, knots: tuple[float, ...], by: str) -> None:
     if by and by not in PER:
         raise ValueError(f"{name}.by = '{by}' is no state of the driver.{nearest(by, PER)}")
@@ -68,6 +72,7 @@ class Curve(Effect):
     """An added acceleration ``+ Σ c_k hat_k(x)``, piecewise linear in one feature x of the scene, free at its knots.
 
     ``by`` another state it is proportional to that (``share_of``): with a curve without, a surface over two states.
+    ``number`` tells curves of one quantity over one feature apart, such as those with other knots.
     """
 
     kind: ClassVar[str] = "curve"
@@ -75,6 +80,7 @@ class Curve(Effect):
     knots: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0)
     period: float | None = None
     by: str = ""
+    number: int = 1
 
     def __post_init__(self) -> None:
         _check("curve", self.feature, self.knots, self.by)
@@ -82,7 +88,7 @@ class Curve(Effect):
     @property
     def name(self) -> str:
         """``curve_over_`` and the feature, so that several curves fit into one simulator; ``_by_`` and the state."""
-        return f"curve_over_{self.feature}" + (f"_by_{self.by}" if self.by else "")
+        return f"curve_over_{self.feature}" + _ending(self.by, self.number)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -103,7 +109,7 @@ class Curve(Effect):
 class DriverCurve(Effect):
     """One driver parameter times ``1 + Σ c_k hat_k(x)`` over one feature x: T(x), v0(t) and their kin.
 
-    ``by`` is that of ``Curve``.
+    ``by`` and ``number`` are those of ``Curve``.
     """
 
     kind: ClassVar[str] = "driver_curve"
@@ -113,6 +119,7 @@ class DriverCurve(Effect):
     knots: tuple[float, ...] = (0.0, 500.0, 1000.0)
     period: float | None = None
     by: str = ""
+    number: int = 1
 
     def __post_init__(self) -> None:
         _check("driver_curve", self.feature, self.knots, self.by)
@@ -122,7 +129,7 @@ class DriverCurve(Effect):
     @property
     def name(self) -> str:
         """The target, ``_over_`` and the feature, ``_by_`` and the state."""
-        return f"{self.target}_over_{self.feature}" + (f"_by_{self.by}" if self.by else "")
+        return f"{self.target}_over_{self.feature}" + _ending(self.by, self.number)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -17,6 +17,8 @@ FOUND = "found_effect.py"
 """An effect in a state that has no name."""
 GROUPS = tuple(f"model_group_{number}.yaml" for number in range(1, 9))
 """Laws of several kinds of drivers."""
+SEARCH = ("search.json", "model_search.yaml")
+"""What a search saw whose judgement failed, and the model that it had come to."""
 EXPLAINED = (
     "report.json",
     "report.html",
@@ -26,6 +28,7 @@ EXPLAINED = (
     "model_corrected.yaml",
     *GROUPS,
     FOUND,
+    *SEARCH,
 )
 """What ``explain`` writes."""
 

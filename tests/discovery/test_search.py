@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from scipy.stats import t as student
 
 from idm_env.data import episodes, synthetic
 from idm_env.discovery import model as terms
-from idm_env.discovery import search
+from idm_env.discovery import search, selection
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
@@ -19,7 +21,11 @@ from idm_env.discovery.score import SYSTEMATIC, half_width, held_out
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import _same_class
 from idm_env.discovery.solve import Problem, Solution, _Nested, linearise, solve
+from idm_env.effects import IDM, Brakes
 from idm_env.jobs.storage import Store
+from idm_env.model_file import Model, load_model, save_model
+from idm_env.roads import Lane
+from idm_env.simulator import Simulator
 
 
 def begun(records: Records, *names: str) -> tuple[Search, Solution]:
@@ -142,3 +148,51 @@ def test_a_curve_has_intervals_over_its_coordinate_in_it() -> None:
     ramp = terms.curve("time_gap", "time", 0.0, 200.0, 2, label="time_gap ramp")
     assert _same_class(zone, Hypothesis((profile,))) and not _same_class(profile, Hypothesis((zone,)))
     assert not _same_class(shift, Hypothesis((profile,))) and not _same_class(shift, Hypothesis((ramp,)))
+
+
+CURVES = (
+    terms.interval("time_gap", "position", 100.0, 200.0, 0.3),
+    terms.interval("time_gap", "time", 20.0, 50.0, 0.3),
+    terms.curve("time_gap", "position", 0.0, 150.0, 4),
+    terms.curve("time_gap", "time", 0.0, 200.0, 2, label="time_gap ramp"),
+    replace(terms.interval("accel_and_decel", "time", 80.0, 1e6, 0.3), label="accel_and_decel step in time"),
+    terms.interval("accel_and_decel", "time", 20.0, 50.0, -0.3),
+    replace(terms.interval("acceleration", "time", 80.0, 1e6, 0.3), label="acceleration step in time"),
+    terms.interval("acceleration", "time", 20.0, 50.0, -0.3),
+    terms.curve("acceleration", "time", 0.0, 8.0, 6),
+    terms.curve("acceleration", "time", 0.0, 5.0, 8, 40.0, label="acceleration over phase"),
+    terms.curve("time_gap", "speed", 0.0, 3.0, 4),
+    terms.curve("time_gap", "speed", 0.0, 3.0, 4, by="gap"),
+)
+"""One of every kind that rounds add without a name, those over one coordinate with other knots among them."""
+
+
+def test_whatever_rounds_join_is_one_model(tmp_path: Path) -> None:
+    """Two rounds may add a curve of one quantity over one coordinate: both are in the model, and read back."""
+    for pair in combinations(CURVES, 2):
+        values = np.concatenate([np.full(t.size, 0.1) if len(t.starts[0]) > 3 else t.starts[0] for t in pair])
+        added, numbers = terms.effects_of(Hypothesis(pair), values)
+        model = Model(effects=(IDM(), *added, Brakes()), parameters=numbers)
+        save_model(tmp_path / "model.yaml", model)
+        again = load_model(tmp_path / "model.yaml")
+        assert again.effects == model.effects and again.parameters == numbers
+        names = [e.name for e in Simulator(Lane(), again.effects).effects]
+        assert len(set(names)) == len(names) == 2 + sum(2 if t.what == "accel_and_decel" else 1 for t in pair)
+
+
+def test_a_latency_below_a_step_that_was_all_that_was_asked_for_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It becomes the null's, and nothing is left to try: that is an answer and no error."""
+    searching, null = begun(made(7, runs=6, followers=2, seconds=60.0, ou=0.0, noise=0.0), "delay")
+    scored, before = searching.round(null, 1)
+    solution = scored[0].solution
+    assert solution is not None
+    model = solution.model
+    short = solve(searching.problem, model, solution.theta, np.array([0.05]), iterations=0)
+    rounds = [([replace(scored[0], solution=short, gains=np.full(6, 0.5))], before), ([], before)]
+    monkeypatch.setattr(Search, "round", lambda *_: rounds.pop(0))
+    monkeypatch.setattr(Search, "null", lambda *_: short)
+    monkeypatch.setattr(Search, "again", lambda _, now, best, scored: (now, scored))
+    monkeypatch.setattr(selection, "_closed_loop_holds", lambda *_: True)
+    null, steps, seen = selection._rounds(searching, null, 0)
+    assert null is not solution and steps == [] and len(seen) == 1
+    assert seen[0].winner is None and seen[0].leading is None
