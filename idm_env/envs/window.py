@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Mapping
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from idm_env.envs.plan import Array, Bound, Plan, address
 from idm_env.envs.values import token_like
 from idm_env.kernels.policy_rows import PolicyRows
 from idm_env.kernels.rows import RowFunction, adjoint
+from idm_env.kernels.sameness import digest
 from idm_env.kernels.window_loop import window, window_back
 from idm_env.scalar.record import Untraceable
 
@@ -25,8 +27,8 @@ if TYPE_CHECKING:
     from idm_env.envs.batch import Batch
     from idm_env.envs.values import Values
 
-_MANY = 1009
-"""Rows of the recording of a policy: no other dimension."""
+_FEW, _MANY, _MOST = 3, 1009, 8
+"""Rows of a policy's recording to compare, to print (no other dimension), and how many prints of one are kept."""
 
 
 class Driver:
@@ -43,40 +45,75 @@ class Driver:
         self, policy: nn.Module, rows: int, width: int, actions: int, dtype: torch.dtype,
         memory: tuple[int, ...] | None = None,
     ) -> None:  # fmt: skip
-        own = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
-        self.names = dict(zip(own, (f"w{i}" for i in range(len(own))), strict=True))
-        self.learned = [self.names[n] for n, _ in policy.named_parameters()]
-        sample = {self.names[n]: x.detach().clone() for n, x in own.items()}
-        if any(x.dtype != dtype or not x.is_contiguous() for x in sample.values()):
+        recording = _Recording(policy, width, actions, dtype, memory)
+        _tried(policy, {n: torch.zeros(rows, *shape, dtype=dtype) for n, shape in recording.shapes.items()}, actions)
+        self.names = recording.names
+        inputs = recording.inputs(_MANY)
+        shared = list(recording.sample)
+        try:
+            self.forward: PolicyRows = PolicyRows(recording.act, inputs, _MANY, shared)
+        except RuntimeError as error:  # it takes as many rows as there are environments, no more
+            raise Untraceable(str(error)) from error
+        self._pulled, self._inputs, self._shared = recording.pulled, recording.seeded(inputs), shared
+
+    @cached_property
+    def backward(self) -> PolicyRows:
+        """The vector-Jacobian product of what it did when it was recorded."""
+        return PolicyRows(self._pulled, self._inputs, _MANY, self._shared)
+
+    def weights(self, policy: nn.Module) -> dict[str, Tensor]:
+        """Return the policy's weights and buffers as they are now, by their short names."""
+        own = _own(policy)
+        return {short: own[n] for n, short in self.names.items()}
+
+
+def _own(policy: nn.Module) -> dict[str, Tensor]:
+    return {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
+
+
+class _Recording:
+    """A policy as a function of its weights and of what it sees, to be recorded; and its adjoint."""
+
+    def __init__(
+        self, policy: nn.Module, width: int, actions: int, dtype: torch.dtype, memory: tuple[int, ...] | None
+    ) -> None:
+        own = _own(policy)
+        if any(x.dtype != dtype or not x.is_contiguous() for x in own.values()):
             raise Untraceable("a policy in another precision than the environment")
-        shapes = {"seen": (width,), **({} if memory is None else {"hidden": memory})}
-        _tried(policy, {n: torch.zeros(rows, *shape, dtype=dtype) for n, shape in shapes.items()}, actions)
+        names = self.names = dict(zip(own, (f"w{i}" for i in range(len(own))), strict=True))
+        learned = [names[n] for n, _ in policy.named_parameters()]
+        self.sample = {names[n]: x.detach().clone() for n, x in own.items()}
+        self.dtype, self.actions = dtype, actions
+        shapes = self.shapes = {"seen": (width,), **({} if memory is None else {"hidden": memory})}
 
         def act(**given: Tensor) -> dict[str, Tensor]:
-            weights = {n: given[short] for n, short in self.names.items()}
+            weights = {n: given[short] for n, short in names.items()}
             done = torch.func.functional_call(policy, weights, tuple(given[n] for n in shapes))
             action, *later = (done,) if memory is None else done
             return {"action": action + given["push"], **dict(zip(["later"], later, strict=False))}
 
-        inputs = {**shapes, "push": (actions,)}
-        leaves = {n: torch.zeros(_MANY, *shape, dtype=dtype) for n, shape in inputs.items()}
-        try:
-            self.forward: PolicyRows = PolicyRows(act, {**leaves, **sample}, _MANY, list(sample))
-        except RuntimeError as error:  # it takes as many rows as there are environments, no more
-            raise Untraceable(str(error)) from error
-        outputs = ["action"] if memory is None else ["action", "later"]
-        back = adjoint(act, outputs, [*shapes, *self.learned])
+        back = adjoint(act, ["action"] if memory is None else ["action", "later"], [*shapes, *learned])
 
         def pulled(**given: Tensor) -> dict[str, Tensor]:
             return {f"to_{n}": x for n, x in back(**given).items()}
 
-        leaves |= {f"on_{n}": torch.zeros_like(x) for n, x in act(**leaves, **sample).items()}
-        self.backward: PolicyRows = PolicyRows(pulled, {**leaves, **sample}, _MANY, list(sample))
+        self.act, self.pulled = act, pulled
 
-    def weights(self, policy: nn.Module) -> dict[str, Tensor]:
-        """Return the policy's weights and buffers as they are now, by their short names."""
-        own = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
-        return {short: own[n] for n, short in self.names.items()}
+    def inputs(self, rows: int) -> dict[str, Tensor]:
+        """Return examples of what the policy takes."""
+        shapes = {**self.shapes, "push": (self.actions,)}
+        return {n: torch.zeros(rows, *shape, dtype=self.dtype) for n, shape in shapes.items()} | self.sample
+
+    def seeded(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return examples of what its adjoint takes."""
+        with torch.no_grad():
+            return {**inputs, **{f"on_{n}": torch.zeros_like(x) for n, x in self.act(**inputs).items()}}
+
+    def digest(self) -> bytes:
+        """Return what tells the policy as it is now from what it was: all that it does, backwards, too."""
+        inputs, graph = self.inputs(_FEW), torch.is_grad_enabled()
+        told = digest(self.act, inputs, PolicyRows.simpler, gradients=graph)
+        return told + (digest(self.pulled, self.seeded(inputs), PolicyRows.simpler) if graph else b"")
 
 
 def _tried(policy: nn.Module, inputs: Mapping[str, Tensor], actions: int) -> None:
@@ -118,19 +155,40 @@ _DRIVERS: weakref.WeakKeyDictionary[nn.Module, dict[Any, Driver | None]] = weakr
 
 
 def driver_of(policy: Any, seen: Tensor, actions: int, hidden: Tensor | None = None) -> Driver | None:
-    """Return a policy as compiled loops, recorded once; None where it runs by torch between the steps."""
+    """Return a policy as compiled loops; None where it runs by torch between the steps.
+
+    It is recorded at every window, and loops are printed where none are the same. One that does something else at
+    every call, or so often something new that printing would take longer, runs between the steps.
+    """
     if not isinstance(policy, nn.Module):
         return None
     drivers, (rows, width), dtype = _DRIVERS.setdefault(policy, {}), seen.shape, seen.dtype
     memory = None if hidden is None else tuple(hidden.shape[1:])
-    weights = tuple((n, x.shape) for n, x in policy.state_dict().items())
-    key = (width, actions, dtype, memory, policy.training, weights)
-    if key not in drivers:
-        try:
-            drivers[key] = Driver(policy, rows, width, actions, dtype, memory)
-        except Untraceable:
-            drivers[key] = None
-    return drivers[key]
+    own = tuple((n, x.shape, x.dtype, x.stride()) for n, x in _own(policy).items())
+    graph = torch.is_grad_enabled()
+    form = (width, actions, dtype, memory, graph, own)
+    if form in drivers:
+        return None
+    try:
+        key = (form, _Recording(policy, width, actions, dtype, memory).digest())
+        if key in drivers:
+            return drivers[key]
+        while len(drivers) >= _MOST:
+            del drivers[next(iter(drivers))]
+        drivers[key] = None
+        made = Driver(policy, rows, width, actions, dtype, memory)
+        if graph:
+            _ = made.backward
+        if _Recording(policy, width, actions, dtype, memory).digest() != key[1]:
+            drivers[form] = None  # it changes by being called
+            return None
+        drivers[key] = made
+    except Untraceable:
+        return None
+    except Exception:  # a policy may raise anything at inputs that it does not take; between the steps that is told
+        _tried(policy, {"seen": seen} | ({} if hidden is None else {"hidden": hidden}), actions)
+        return None
+    return made
 
 
 class _Segment(NamedTuple):

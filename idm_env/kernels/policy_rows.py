@@ -178,8 +178,9 @@ class PolicyRows(RowFunction):
         self._enter(x, place._replace(offset=place.offset * PITCH, strides=strides))
 
     def _number(self, value: float | int | bool, kind: str) -> str:
-        # As it stands: a table of constants would be read anew for every row.
-        return f"F({float(value)!r})" if kind == "f" and math.isfinite(value) else super()._number(value, kind)
+        # From a table: a number that a policy changes from window to window is no reason to compile it anew.
+        plain = kind == "f" and value in (0.0, 1.0, -1.0)
+        return f"F({float(value)!r})" if plain else super()._number(value, kind)
 
     def _at(self, x: Any, cell: Sequence[str], kind: str | None = None) -> str:
         if not isinstance(x, Tensor):
@@ -337,7 +338,7 @@ class PolicyRows(RowFunction):
         return copied
 
 
-_SHARED = re.compile(r"\b(?:in_\w+|t\d+)\[[^\[\]]*\]")
+_SHARED = re.compile(r"\b(?:in_\w+|t\d+|c)\[[^\[\]]*\]")
 """An element of what is the same for all rows."""
 
 _ALONG, _SPREAD = ("sum", "mean", "cat"), ("slice_backward", "select_backward")

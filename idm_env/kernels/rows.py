@@ -81,9 +81,21 @@ class _Recorder(Uncompiled, TorchDispatchMode):
         if func in self._simpler:
             with self:
                 return self._simpler[func](*args, **(kwargs or {}))
+        if torch.Tag.nondeterministic_seeded in func.tags:
+            raise Untraceable(f"chance ({func._schema.name})")
         out = func(*args, **(kwargs or {}))
         self.calls.append((func._schema.name.removeprefix("aten::"), args, kwargs or {}, out))
         return out
+
+
+def recorded(
+    function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor],
+    simpler: Mapping[Any, Callable[..., Any]],
+) -> tuple[list[tuple[str, tuple[Any, ...], dict[str, Any], Any]], dict[str, Tensor]]:  # fmt: skip
+    """Return the operations of one call of a function, and what it returns. Untraceable where it asks for chance."""
+    with torch.no_grad(), recording(), _Recorder(simpler) as recorder:
+        results = dict(function(**inputs))
+    return recorder.calls, results
 
 
 class RowFunction:
@@ -118,19 +130,18 @@ class RowFunction:
         self._tables: list[np.ndarray] = []
         self._table_of: dict[int, str] = {}
         self._parts: list[list[str]] = []
-        with torch.no_grad(), recording(), _Recorder(self.simpler) as recorder:
-            results = dict(function(**inputs))
+        made, results = recorded(function, inputs, self.simpler)
         self._floats = next(x.dtype for x in (*inputs.values(), *results.values()) if x.is_floating_point())
         for name, x in inputs.items():
             self._given(name, x)
         self._blanks: dict[int, float] = {}
-        for called, args, _, out in recorder.calls:
+        for called, args, _, out in made:
             if called in _BLANK:
                 self._blanks[storage(out)] = _BLANK[called]
             elif called in _FULL:
                 self._blanks[storage(out)] = args[_FULL[called]]
-        _refuse_forks(recorder.calls, list(inputs.values()))
-        calls = _needed(recorder.calls, list(results.values()))
+        _refuse_forks(made, list(inputs.values()))
+        calls = _needed(made, list(results.values()))
         self._calls = calls
         for call in calls:
             self._print(*call)

@@ -13,6 +13,7 @@ from torch import nn
 
 import idm_env  # noqa: F401
 from idm_env.envs.vector import DiffIDMVectorEnv
+from idm_env.envs.window import driver_of
 
 pytest.importorskip("numba")
 
@@ -280,3 +281,110 @@ def test_the_tape_goes_with_the_graph():
     del window
     gc.collect()
     assert tape() is None
+
+
+class Tuned(nn.Module):
+    """A policy that depends on more than its weights: a number, a flag, a tensor that is no buffer, a global."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer, self.norm, self.bend = nn.Linear(3, 1), nn.LayerNorm(3), nn.Tanh()
+        self.gain, self.mean, self.cut = 0.5, torch.zeros(3), False
+
+    def forward(self, seen):
+        seen = self.norm(seen - self.mean)
+        return self.bend(self.layer(seen.detach() if self.cut else seen)) * self.gain + GLOBAL["offset"]
+
+
+GLOBAL = {"offset": 0.0}
+
+
+def _hooked(policy):
+    policy.layer.register_forward_hook(lambda module, given, out: out * 0.5)
+
+
+def _bent(policy):
+    policy.bend = nn.Sigmoid()
+
+
+def _replaced(policy):
+    policy.forward = lambda seen: seen[:, :1] * policy.layer.weight[0, 0]
+
+
+CHANGES = {
+    "number": lambda p: setattr(p, "gain", -0.7),
+    "tensor": lambda p: setattr(p, "mean", torch.ones(3)),
+    "tensor in place": lambda p: p.mean.add_(1.0),
+    "flag of the gradient": lambda p: setattr(p, "cut", True),
+    "eps": lambda p: setattr(p.norm, "eps", 1.0),
+    "global": lambda p: GLOBAL.update(offset=0.3),
+    "activation": _bent,
+    "hook": _hooked,
+    "forward": _replaced,
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_window_drives_the_policy_as_it_is_now(change):
+    env, plain = (made("ring", {"warmup": 5, "max_episode_steps": 100}, "float64") for _ in range(2))
+    torch.manual_seed(0)
+    policy = Tuned().double()
+    policy.mean = policy.mean.double()
+    GLOBAL["offset"] = 0.0
+    for again in range(2):
+        for each in (env, plain):
+            each.reset(seed=3)
+        first, wanted = env.unroll(policy, 4), plain.unroll(lambda x: policy(x), 4)
+        if again == 0:
+            CHANGES[change](policy)
+    torch.testing.assert_close(first.action, wanted.action)
+    found, own = (
+        torch.autograd.grad(w.reward.sum(), policy.parameters(), allow_unused=True, materialize_grads=True)
+        for w in (first, wanted)
+    )
+    for x, y in zip(found, own, strict=True):
+        torch.testing.assert_close(x, y)
+    GLOBAL["offset"] = 0.0
+
+
+class Restless(nn.Linear):
+    """A policy that is another one at every call."""
+
+    calls = 0
+
+    def forward(self, seen):
+        self.calls += 1
+        return super().forward(seen) * (1.0 / self.calls)
+
+
+def test_a_policy_that_changes_by_being_called_runs_between_steps():
+    env = made("ring", CASES[0][1], "float32")
+    env.reset(seed=3)
+    policy = Restless(3, 1)
+    env.unroll(policy, 3)
+    before = policy.calls
+    window = env.unroll(policy, 3)
+    assert policy.calls == before + 3
+    wanted = nn.Linear.forward(policy, window.observation[1]) / (before + 2)
+    torch.testing.assert_close(window.action[1], wanted)
+
+
+def test_a_tensor_with_a_gradient_that_is_no_parameter_has_it():
+    env = made("ring", CASES[0][1], "float32")
+    env.reset(seed=3)
+    policy = Tuned()
+    policy.gain = torch.tensor(0.5, requires_grad=True)
+    (gradient,) = torch.autograd.grad(env.unroll(policy, 5).action.sum(), policy.gain)
+    assert bool(gradient != 0.0)
+
+
+def test_an_annealed_number_is_compiled_once():
+    env = made("ring", CASES[0][1], "float32")
+    env.reset(seed=3)
+    policy = Tuned()
+    calls = set()
+    for step in range(4):
+        policy.gain = 0.5 - 0.01 * step
+        driver = driver_of(policy, env.unroll(policy, 2).observation[-1], 1)
+        calls |= {driver.forward.call, driver.backward.call}
+    assert len(calls) == 2
