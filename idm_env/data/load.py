@@ -6,20 +6,21 @@ import glob
 import gzip
 import io
 import re
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
-from idm_env.data import drones, folder, ngsim, openacc, tidy, ultra_av
+from idm_env.data import drones, folder, ngsim, openacc, plain, tidy, ultra_av
 from idm_env.data.errors import DataError, Repair, listed, missing_column, nearest
 from idm_env.data.names import Columns, check_columns, renamed, unread
 from idm_env.data.schema import TIDY
 from idm_env.data.trajectories import Trajectories, parted
 
 LAYOUTS = ("auto", "tidy", "ngsim", "openacc", "ultra_av", *drones.CSV, *drones.FILES)
-EXTENSIONS = (".csv", ".csv.gz", ".parquet")
+EXTENSIONS = (".csv", ".csv.gz", ".parquet", *plain.ENDINGS)
 BATCH_BYTES, BATCH_ROWS = 16_000_000, 200_000
 """Text and rows that ``batches`` holds at a time."""
 HEAD_ROWS = 100
@@ -106,7 +107,7 @@ def refuse_head(
 def read(
     path: str | Path, *, layout: str = "auto", columns: Columns = None, rows: int | None = None
 ) -> tuple[pl.DataFrame, list[Repair]]:
-    """Return the tidy frame of a file, in SI units and not checked yet, and what its reader repaired.
+    """Return the tidy frame of a file, in SI units and not checked yet, and the repairs of its reader.
 
     ``rows`` are read at most, where it is a table.
 
@@ -114,6 +115,7 @@ def read(
         DataError: If the file cannot be read or its layout is unknown.
     """
     path, layout = Path(path), _layout(layout, columns)
+    path = _plain(path)
     if own := _own_reader(path, layout):
         return own(path)
     extension, lines, written = _checked(path)
@@ -143,6 +145,7 @@ def batches(
             for frame, repairs in batches(file, layout=layout, columns=columns):
                 yield frame.with_columns(labels), repairs
         return
+    path = _plain(path)
     if own := _own_reader(path, layout):
         yield own(path)
         return
@@ -228,6 +231,8 @@ def _plain_layout(
     drone_layout = layout if layout in drones.CSV else drones.layout_of(table.columns) if layout == "auto" else None
     if drone_layout:
         return drones.CSV[drone_layout](table, source)
+    if layout == "auto" and {"timestep_time", "vehicle_pos", "vehicle_lane"} <= {*table.columns}:
+        return plain.sumo(table), []
     if layout == "auto":
         tidy.check(table.columns, source)
     frame, repairs = tidy.read(table)
@@ -267,6 +272,18 @@ def _checked(path: Path) -> tuple[str, list[str], dict[str, Any]]:
     rows = "".join(lines[1:])
     comma = mark != "," and bool(re.search(r"\d,\d", rows)) and not re.search(r"\d\.\d", rows)
     return extension, lines, {"separator": mark, "decimal_comma": comma}
+
+
+def _plain(path: Path) -> Path:
+    """Return the path of a plain copy of a text file; other files unchanged."""
+    if path.name.lower().endswith((".parquet", ".json")) or not path.is_file() or not path.stat().st_size:
+        return path
+    try:
+        return plain.plain(path) if path.name.lower().endswith(EXTENSIONS) else path
+    except DataError:
+        raise
+    except (*_UNREADABLE, zipfile.BadZipFile) as error:
+        raise _unreadable(path, error) from None
 
 
 def _first_lines(path: Path, count: int) -> list[str]:

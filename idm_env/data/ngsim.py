@@ -34,6 +34,10 @@ _ALIASES = (
 )
 ALIASES = {other: name for name, other in (pair.split("=") for pair in _ALIASES.split())}
 """Names of the motorways' files, by those of the arterials' (Lankershim, Peachtree) and of copies."""
+_HEAD = "vehicle_id frame_id total_frames global_time local_x local_y x y v_length v_width v_class v_vel v_acc lane_id"
+_ZONES, _TAIL = "o_zone d_zone int_id section_id direction movement", "preceding following space_headway time_headway"
+WITHOUT_HEADER = {18: f"{_HEAD} {_TAIL}".split(), 24: f"{_HEAD} {_ZONES} {_TAIL}".split()}
+"""Names of the columns of the original text files, which have no line of names, by their number."""
 _OTHERS = {"v_class": "vehicle_class", "direction": "direction", "section_id": "section", "int_id": "intersection"}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -243,3 +245,119 @@ def test_lanes_that_are_labels_are_lanes(tmp_path: Path) -> None:
     assert np.allclose(found.table["gap_m"].drop_nulls(), 30.5)
     told = refused(tmp_path / "a.csv", tmp_path, NAMED)
     assert "vehicles overlap in 6 of 12 rows: is a lane missing" in told
+
+
+def chain_of(found: Trajectories, gap: float = 25.5) -> None:
+    assert leaders(found) == CHAIN
+    assert np.allclose(found.table["gap_m"].drop_nulls(), gap, atol=0.01)
+
+
+def zipped(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.csv", text())
+
+
+def ends() -> str:
+    return text().replace("\n", ",\n")
+
+
+WRITTEN: dict[str, tuple[str, Callable[[Path], object]]] = {
+    "lines above the header": ("a.csv", lambda p: p.write_text("# exported 2024\n# by hand\n" + text())),
+    "Excel's line of the mark": ("a.csv", lambda p: p.write_text("sep=;\n" + text(";"))),
+    "Unicode text of Excel": ("a.csv", lambda p: p.write_bytes(text("\t").encode("utf-16"))),
+    "a byte order mark": ("a.csv", lambda p: p.write_bytes(b"\xef\xbb\xbf" + text().encode())),
+    "a mark at the end of rows": ("a.csv", lambda p: p.write_text(ends().replace("lane,", "lane", 1))),
+    "tabs": ("a.tsv", lambda p: p.write_text(text("\t"))),
+    "a text file": ("a.txt", lambda p: p.write_text(text())),
+    "gz of a text file": ("a.txt.gz", lambda p: p.write_bytes(gzip.compress(text().encode()))),
+    "zip": ("a.csv.zip", zipped),
+    "ends of lines of Windows": ("a.csv", lambda p: p.write_text(text().replace("\n", "\r\n"))),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_table_is_read_however_it_is_written(name: str, tmp_path: Path) -> None:
+    file, write = WRITTEN[name]
+    write(tmp_path / file)
+    chain_of(read_alike(tmp_path / file, tmp_path))
+
+
+REFUSED: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "no header": ("a.csv", lambda p: p.write_text(text().partition("\n")[2]), "the first line holds numbers"),
+    "several files in one": (
+        "a.zip",
+        lambda p: [zipfile.ZipFile(p, "a").writestr(f"{n}.csv", text()) for n in range(2)],
+        "holds 2 files",
+    ),
+    "another xml": ("a.xml", lambda p: p.write_text("<routes><vehicle id='a'/></routes>"), "is XML of <routes>"),
+    "half of an xml": ("a.xml", lambda p: p.write_text("<fcd-export><timestep time='0'>"), "is no whole XML"),
+    "no zip": ("a.zip", lambda p: p.write_bytes(b"PK"), "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_read_is_told(name: str, tmp_path: Path) -> None:
+    file, write, rule = REFUSED[name]
+    write(tmp_path / file)
+    assert rule in refused(tmp_path / file, tmp_path)
+
+
+def sumo_csv(path: Path) -> None:
+    FCD.write_csv(path, separator=";")
+
+
+def sumo_xml(path: Path) -> None:
+    steps = []
+    for (time,), rows in FCD.group_by("timestep_time", maintain_order=True):
+        cars = "".join(
+            f'<vehicle id="{r["vehicle_id"]}" x="1" y="2" speed="{r["vehicle_speed"]}" pos="{r["vehicle_pos"]}" '
+            f'lane="{r["vehicle_lane"]}"/>'
+            for r in rows.iter_rows(named=True)
+        )
+        steps.append(f'<timestep time="{time}">{cars}<person id="p" pos="1" edge="E0"/></timestep>')
+    content = f"<?xml version='1.0'?><fcd-export>{''.join(steps)}</fcd-export>".encode()
+    path.write_bytes(gzip.compress(content) if path.suffix == ".gz" else content)
+
+
+@pytest.mark.parametrize(("write", "name"), [(sumo_csv, "a.csv"), (sumo_xml, "a.xml"), (sumo_xml, "a.xml.gz")])
+def test_lanes_of_sumo_are_those_of_an_edge(write: Callable[[Path], None], name: str, tmp_path: Path) -> None:
+    write(tmp_path / name)
+    found = read_alike(tmp_path / name, tmp_path)
+    assert leaders(found) == {("f.0", None), ("f.1", None), ("f.2", "f.0")} and found.runs() == ["E0"]
+    assert np.allclose(found.table["gap_m"].drop_nulls(), 30.5)
+
+
+def test_each_edge_of_sumo_is_a_road_of_its_own(tmp_path: Path) -> None:
+    """Positions begin anew on the next edge, also on an internal one; leaderID is a leader."""
+    late = pl.col("timestep_time") >= 3
+    edge = pl.when(late).then(pl.lit(":J0_1_0")).otherwise("vehicle_lane").alias("vehicle_lane")
+    back = pl.when(late).then(pl.col("vehicle_pos") - 210.0).otherwise("vehicle_pos").alias("vehicle_pos")
+    more = FCD.filter(pl.col("vehicle_id") != "f.1").with_columns(edge, back)
+    more.write_csv(tmp_path / "a.csv", separator=";")
+    assert read_alike(tmp_path / "a.csv", tmp_path).runs() == [":J0_1", "E0"]
+    ahead = pl.when(pl.col("vehicle_id") == "f.2").then(pl.lit("f.0")).otherwise(pl.lit("")).alias("vehicle_leaderID")
+    more.with_columns(ahead).write_csv(tmp_path / "c.csv", separator=";")
+    assert leaders(load(tmp_path / "c.csv")) == {("f.0", None), ("f.2", "f.0")}
+
+
+@pytest.mark.parametrize("columns", [18, 24])
+def test_text_files_of_ngsim_have_no_header(columns: int, tmp_path: Path) -> None:
+    lines = ["   ".join(f"{x:g}" if x < 1e6 else f"{x:.0f}" for x in row) for row in ngsim((14.5,) * 3, columns)]
+    (tmp_path / "trajectories-0400-0415.txt").write_text("\n".join(lines) + "\n")
+    found = read_alike(tmp_path / "trajectories-0400-0415.txt", tmp_path)
+    assert leaders(found) == {("1", None), ("2", "1"), ("3", "2")}
+    assert np.allclose(found.table["gap_m"].drop_nulls(), 30 - 14.5 * 0.3048, atol=0.01)
+
+
+def test_vehicle_records_of_vissim_are_read(tmp_path: Path) -> None:
+    rows = [
+        f"{t:.2f};{n + 1};7;1;{start + w:.2f};{3.6 * v:.2f};5.0"
+        for t, w, v in zip(TIMES, WAY, SPEED, strict=True)
+        for n, start in enumerate(STARTS)
+    ]
+    head = ["$VISION", "* PTV Vissim", "* km/h", "$VEHICLE:SIMSEC;NO;LANE\\LINK\\NO;LANE\\INDEX;POS;SPEED;LENGTH"]
+    (tmp_path / "a.fzp").write_text("\n".join([*head, *rows, ""]))
+    found = read_alike(tmp_path / "a.fzp", tmp_path)
+    assert leaders(found) == {("1", None), ("2", "1"), ("3", "2")} and found.runs() == ["7"]
+    assert np.allclose(found.table["gap_m"].drop_nulls(), 25.0)
+    assert abs(found.table["speed_mps"].max() - 12.0) < 1e-6  # type: ignore[operator]
