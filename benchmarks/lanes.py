@@ -479,6 +479,8 @@ class Stood(NamedTuple):
     """Of some episodes: the longest stand of any vehicle (s, each), vehicles an hour from lane 0, and out.
 
     ``hard`` are seconds in which a vehicle brakes by more than 6 m/s², an episode; ``touched`` those with a gap ≤ 0.
+    ``emergencies`` are brakings beyond 8 m/s², an hour of each episode, however long one lasts. ``left`` is the least
+    time gap (s) that a change left to a follower above 5 m/s, and that of a hundredth of these changes.
     """
 
     longest: list[float]
@@ -486,9 +488,12 @@ class Stood(NamedTuple):
     out: float
     hard: float
     touched: float
+    emergencies: list[float]
+    left: tuple[float, float]
 
 
-BEFORE = ({"gap_acceptance": {"strength": 0.0}, "courtesy": {"weight": 0.0}, "mandatory_change": {"turns": 0.0}}, {})
+WITHOUT = {"gap_acceptance": "strength", "courtesy": "weight", "mandatory_change": "turns", "calm": "coolness"}
+BEFORE: tuple[dict[str, Any], ...] = ({effect: {name: 0.0} for effect, name in WITHOUT.items()}, {})
 DEMANDS = {
     "merge 2400 + 500": (MergeTask, {"inflow": 2400.0, "ramp_inflow": 500.0}),
     "merge 3000 + 800": (MergeTask, {"inflow": 3000.0, "ramp_inflow": 800.0}),
@@ -503,6 +508,7 @@ def stood(task: OpenLanesTask, rows: int = 8, seconds: int = 600) -> Stood:
     state = task.begin(Draw.of(torch.arange(rows), torch.zeros(rows, dtype=torch.int64)), params).state
     now = torch.zeros_like(state.speed)
     longest, merged, hard, touched = now, 0, 0, 0
+    brakes, events, left = now > 0, torch.zeros(rows), [torch.zeros(0)]
     for _ in range(seconds):
         before = state
         state, motion = simulator.rollout(state, {}, params, round(1.0 / simulator.dt))
@@ -512,28 +518,41 @@ def stood(task: OpenLanesTask, rows: int = 8, seconds: int = 600) -> Stood:
         longest = torch.maximum(longest, now)
         hard += int((same & (motion.accel < -6.0).any(0)).sum())
         touched += int((same & (motion.gap <= 0.0).any(0)).sum())
+        each = torch.cat((brakes.unsqueeze(0), motion.accel < -8.0))
+        events += (each[1:] & ~each[:-1] & same).sum((0, -1))
+        brakes = each[-1]
+        follower = state.lanes.follower
+        changed = same & (state.lanes.changed > before.lanes.changed) & (follower != torch.arange(now.shape[-1]))
+        gap, speed = (x[0].gather(-1, follower)[changed] for x in (motion.gap, motion.speed))
+        left.append((gap / speed)[speed > 5.0])
         merged += int((same & (before.lanes.lane == 0) & (state.lanes.lane != 0)).sum())
     assert state.lanes is not None and state.lanes.trips is not None
     hourly = 3600.0 / seconds / rows
+    gaps = torch.cat(left)
     return Stood(
         longest.amax(-1).tolist(),
         merged * hourly,
         float(state.lanes.trips.left.sum()) * hourly,
         hard / rows,
         touched / rows,
+        (events * hourly * rows).tolist(),
+        (float(gaps.min()), float(gaps.quantile(0.01))),
     )
 
 
 def standing() -> None:
     """Print how long vehicles stand in the open tasks."""
     head = ("", "drivers", "longest stand in each of 8 × 600 s (s)", "from lane 0, vehicles/h", "out, vehicles/h",
-            "hard brakings, s", "touched, s")  # fmt: skip
+            "hard brakings, s", "touched, s", "beyond 8 m/s², 1/h", "time gap left, s")  # fmt: skip
     rows = []
     for name, (kind, keywords) in DEMANDS.items():
         for drivers, changed in zip(("without", "as they come"), BEFORE, strict=True):
             episodes = stood(kind(parameters=changed, **keywords))
             each = ", ".join(f"{x:.0f}" for x in episodes.longest)
-            rows.append([name, drivers, each, *(f"{x:.0f}" for x in episodes[1:])])
+            events = torch.tensor(episodes.emergencies)
+            half = 2.365 * float(events.std()) / len(events) ** 0.5  # Student's t of 7 degrees of freedom
+            beyond, left = f"{float(events.mean()):.0f} ± {half:.0f}", "{:.2f}, {:.2f}".format(*episodes.left)
+            rows.append([name, drivers, each, *(f"{x:.0f}" for x in episodes[1:5]), beyond, left])
     print(table(head, rows))
 
 

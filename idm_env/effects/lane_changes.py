@@ -24,6 +24,9 @@ STANDS = 1.0
 QUEUES = 3.0
 """Behind somebody below this speed (m/s) a driver queues."""
 
+_CRAWLS = 2.0
+"""Below this speed (m/s) nobody brakes for long, however hard."""
+
 _BLOCK = 256
 """The fewest slots that decide together."""
 
@@ -150,10 +153,13 @@ class GapAcceptance(Effect):
         T_d = T (1 − γ d),   s0_d = s0 (1 − d),   b_d = b_safe + d (b_most − b_safe),   safe where A_d ≥ −b_d
         τ dm/dt = [v < 1 m/s] − m,   utility → (1 − d) · (sum over effects) + d · (largest of one effect)
 
+        and above 2 m/s A ≥ −b_h;   for every change s ≥ v T_min + s0 (0.1 + 0.4 min(1, v / 5 m/s))
+
     u says how near the end x of the lane is, m how long the driver has stood. A_d is what the follower there would
-    want, and the driver himself, with T_d and s0_d in IDM's ``a (s*/s)²``. After the desire of LMRS: with it the
-    accepted headway shrinks, the accepted deceleration grows, and voluntary reasons count less (Schakel, Knoop, van
-    Arem 2012). A gap accepted so counts as safe whatever other effects say. Absent at c = 0.
+    want, and the driver himself, with T_d and s0_d in IDM's ``a (s*/s)²``; A is what they will do. After the desire of
+    LMRS: with it the accepted headway shrinks, the accepted deceleration grows, and voluntary reasons count less
+    (Schakel, Knoop, van Arem 2012). A gap accepted so counts as safe whatever other effects say, but none below the
+    last line, where v and s are the follower's and the driver's own. Absent at c = 0.
     """
 
     kind: ClassVar[str] = "gap_acceptance"
@@ -165,6 +171,8 @@ class GapAcceptance(Effect):
         _SAFE_DECEL,
         Parameter("most_decel", "b_most", "m/s²", 9.0, 0.5, 9.0, role="shape"),
         Parameter("patience", "τ", "s", 10.0, 1.0, 300.0, role="shape"),
+        Parameter("hardest", "b_h", "m/s²", 7.5, 0.5, 1e6, role="threshold"),
+        Parameter("least_time_gap", "T_min", "s", 0.4, 0.0, 5.0, role="threshold"),
     )
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
@@ -201,12 +209,31 @@ class GapAcceptance(Effect):
 
             own = eased(side.wanted, scene.speed, side.leader.gap, side.leader.speed)
             other = eased(side.with_me, side.follower.speed, side.follower.gap, scene.speed)
-            follower = torch.where(side.follower.present > 0, other + most, most)
-            safe = torch.minimum(follower, own - torch.minimum(here.wanted, -most))
+            other = torch.minimum(other + most, side.with_me + hardest(side.follower.speed))
+            follower = torch.where(side.follower.present > 0, other, most)
+            own = torch.minimum(
+                own - torch.minimum(here.wanted, -most),
+                side.wanted - torch.minimum(here.wanted, -hardest(scene.speed)),
+            )
+            safe = torch.minimum(torch.minimum(follower, own), room(side))
             return torch.where(desire > 0, safe, -COMMANDED)
 
-        sure, desires = none + COMMANDED, (wished(left), wished(right))
-        return Wish(none, none, sure, sure, None, None, despite(left, desires[0]), despite(right, desires[1]), *desires)
+        def hardest(speed: Tensor) -> Tensor:
+            return torch.where(speed > _CRAWLS, p["hardest"], COMMANDED)
+
+        def room(side: Beside) -> Tensor:
+            """Return by how much both gaps exceed the least that anybody accepts, as a margin."""
+            pairs = ((side.follower, side.follower.speed), (side.leader, scene.speed))
+            more = (torch.where(other.present > 0, other.gap - least(speed), COMMANDED) for other, speed in pairs)
+            return torch.where(p["strength"] > 0, torch.minimum(*more), COMMANDED)
+
+        def least(speed: Tensor) -> Tensor:
+            share = 0.1 + 0.4 * (speed / 5.0).clamp_max(1.0)
+            return p["least_time_gap"] * speed + driver.min_gap * share
+
+        desires = wished(left), wished(right)
+        accepted = despite(left, desires[0]), despite(right, desires[1])
+        return Wish(none, none, room(left), room(right), None, None, *accepted, *desires)
 
 
 @dataclass(frozen=True)

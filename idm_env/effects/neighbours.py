@@ -13,7 +13,7 @@ from torch import Tensor
 
 from idm_env.effects import references
 from idm_env.effects.base import Effect, Neighbour, P, Sought
-from idm_env.effects.idm import interaction
+from idm_env.effects.idm import SMALLEST_GAP, free_accel, interaction
 from idm_env.parameters import Parameter
 from idm_env.types import Adjacent, Driver, Scene
 
@@ -177,6 +177,50 @@ class Courtesy(Effect):
         more = torch.relu(interaction(driver, scene.speed, other.gap, other.speed) - own)
         most = torch.minimum(driver.comfort_decel, scene.speed / STANDSTILL_S + p["zipper"] * driver.comfort_decel)
         return -p["weight"] * other.present * torch.minimum(most, driver.max_accel * more)
+
+
+def constant_acceleration(scene: Scene, driver: Driver) -> Tensor:
+    """Return the acceleration that just avoids a crash if the leader keeps his own (m/s²), ``[..., n]``.
+
+    ::
+
+        ã = min(a_l, a);   v² ã / (v_l² − 2 s ã)   where he stops first, ã < 0 and v_l (v − v_l) ≤ −2 s ã,
+        else ã − max(0, v − v_l)² / 2s
+    """
+    speed, lead, gap = scene.speed, scene.leader.speed, scene.leader.gap.clamp_min(SMALLEST_GAP)
+    accel = torch.minimum(scene.leader.accel, driver.max_accel)
+    stops = (accel < 0) & (lead * (speed - lead) <= -2.0 * gap * accel)
+    to_stop = speed * speed * accel / (lead * lead - 2.0 * gap * accel).clamp_min(1e-3)
+    return torch.where(stops, to_stop, accel - torch.relu(speed - lead).square() / (2.0 * gap))
+
+
+@dataclass(frozen=True)
+class Calm(Effect):
+    """Less braking behind whoever cuts in: no more of IDM's than a leader who keeps his acceleration requires.
+
+    ::
+
+        + c max(0, a_CAH + b tanh((a_IDM − a_CAH) / b) − a_IDM),   a_CAH as ``constant_acceleration``
+
+    IDM brakes for a gap that is suddenly too close as in an emergency, also behind a leader who drives away. With c
+    near 1 drivers let the gap grow slowly again. The ACC model of Kesting, Treiber and Helbing (2010), c = 0.99.
+    """
+
+    kind: ClassVar[str] = "calm"
+    sought: ClassVar[Sought] = "never"
+    sources: ClassVar[tuple[str, ...]] = (references.KESTING_2010,)
+    adds: ClassVar[bool] = True
+    title: ClassVar[str] = "calm behind who cuts in"
+    equation: ClassVar[str] = "+ c max(0, a_CAH + b tanh((a_IDM − a_CAH)/b) − a_IDM)"
+    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("coolness", "c", "1", 0.99, 0.0, 1.0, null=0.0),)
+
+    def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return by how much less drivers brake (m/s²)."""
+        brake = interaction(driver, scene.speed, scene.leader.gap, scene.leader.speed)
+        idm = free_accel(driver, scene.speed) - driver.max_accel * brake
+        calm, b = constant_acceleration(scene, driver), driver.comfort_decel
+        calm = calm + b * torch.tanh((idm - calm) / b)
+        return p["coolness"] * scene.leader.present * torch.relu(calm - idm)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,11 @@ KESTING_2007 = (
     "Kesting, A., Treiber, M., Helbing, D. (2007). General lane-changing model MOBIL for car-following models. "
     "Transportation Research Record 1999, 86–94. doi:10.3141/1999-10"
 )
+KESTING_2010 = (
+    "Kesting, A., Treiber, M., Helbing, D. (2010). Enhanced intelligent driver model to access the impact of driving "
+    "strategies on traffic capacity. Philosophical Transactions of the Royal Society A 368, 4585–4605. "
+    "doi:10.1098/rsta.2010.0084"
+)
 LAVAL_2008 = (
     "Laval, J. A., Leclercq, L. (2008). Microscopic modeling of the relaxation phenomenon using a macroscopic lane-"
     "changing model. Transportation Research Part B 42(6), 511–522. doi:10.1016/j.trb.2007.10.004"

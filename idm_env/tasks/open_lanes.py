@@ -12,7 +12,18 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import IDM, Brakes, Control, Courtesy, Effect, GapAcceptance, LaneClosure, MandatoryChange, Mobil
+from idm_env.effects import (
+    IDM,
+    Brakes,
+    Calm,
+    Control,
+    Courtesy,
+    Effect,
+    GapAcceptance,
+    LaneClosure,
+    MandatoryChange,
+    Mobil,
+)
 from idm_env.metrics import CO2, fuel
 from idm_env.multilane import demand
 from idm_env.roads import Lanes
@@ -86,7 +97,8 @@ class OpenLanesTask(LanesTask):
     agent's vehicle waits or has left, its observation and infos are zeros, and its command does nothing.
 
     Drivers let in whoever signals, accept closer gaps near the end of a lane and where they have stood
-    (``GapAcceptance``), and take turns at an end as at a zipper (``Courtesy``, ``MandatoryChange``).
+    (``GapAcceptance``), stay calm where somebody cuts in (``Calm``), and take turns at an end as at a zipper
+    (``Courtesy``, ``MandatoryChange``).
 
     Observation, per agent: own speed, lane, 1 if it is on the road, how far its lane goes on (m, at most 500), its
     place (m), how far it is to the next end of any lane (m, at most 500) and how many lanes to the left that is; then
@@ -115,7 +127,7 @@ class OpenLanesTask(LanesTask):
     """
 
     own_effects: ClassVar[tuple[Effect, ...]] = (
-        IDM(), Mobil(), MandatoryChange(), GapAcceptance(), Courtesy(), Brakes(),
+        IDM(), Calm(), Mobil(), MandatoryChange(), GapAcceptance(), Courtesy(), Brakes(),
     )  # fmt: skip
     own_parameters: ClassVar = {
         "idm": {"max_accel": 1.5, "comfort_decel": 2.0, "time_gap": 1.2, "min_gap": 2.0, "desired_speed": 30.0},
