@@ -137,7 +137,7 @@ class Follower(Effect):
 
 @dataclass(frozen=True)
 class Courtesy(Effect):
-    """Room for whoever signals beside one: he is followed, too, with a weight, and never braked for harder than b.
+    """Room for a vehicle that signals beside one: it is followed, too, with a weight; none brakes harder than b for it.
 
     ::
 
@@ -170,7 +170,7 @@ class Courtesy(Effect):
     needs: ClassVar[frozenset[str]] = frozenset({"merger"})
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return the braking for whoever signals (m/s²)."""
+        """Return the braking for the vehicle that signals (m/s²)."""
         other = scene.merger
         assert other is not None
         own = interaction(driver, scene.speed, scene.leader.gap, scene.leader.speed) * scene.leader.present
@@ -196,7 +196,7 @@ def constant_acceleration(scene: Scene, driver: Driver) -> Tensor:
 
 @dataclass(frozen=True)
 class Calm(Effect):
-    """Less braking behind whoever cuts in: no more of IDM's than a leader who keeps his acceleration requires.
+    """Less braking behind a vehicle that cuts in: no more of IDM's than a leader of constant acceleration requires.
 
     ::
 

@@ -58,7 +58,7 @@ class Driver:
 
     @cached_property
     def backward(self) -> PolicyRows:
-        """The vector-Jacobian product of what it did when it was recorded."""
+        """The vector-Jacobian product of the recorded policy."""
         return PolicyRows(self._pulled, self._inputs, _MANY, self._shared)
 
     def weights(self, policy: nn.Module) -> dict[str, Tensor]:
@@ -72,7 +72,7 @@ def _own(policy: nn.Module) -> dict[str, Tensor]:
 
 
 class _Recording:
-    """A policy as a function of its weights and of what it sees, to be recorded; and its adjoint."""
+    """A policy as a function of its weights and its inputs, to be recorded; and its adjoint."""
 
     def __init__(
         self, policy: nn.Module, width: int, actions: int, dtype: torch.dtype, memory: tuple[int, ...] | None
@@ -100,20 +100,20 @@ class _Recording:
         self.act, self.pulled = act, pulled
 
     def inputs(self, rows: int) -> dict[str, Tensor]:
-        """Return examples of what the policy takes."""
+        """Return examples of the policy's inputs."""
         shapes = {**self.shapes, "push": (self.actions,)}
         return {n: torch.zeros(rows, *shape, dtype=self.dtype) for n, shape in shapes.items()} | self.sample
 
     def seeded(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return examples of what its adjoint takes."""
+        """Return examples of its adjoint's inputs."""
         with torch.no_grad():
             return {**inputs, **{f"on_{n}": torch.zeros_like(x) for n, x in self.act(**inputs).items()}}
 
     def digest(self) -> bytes:
-        """Return what tells the policy as it is now from what it was: all that it does, backwards, too."""
+        """Return the digest of all operations of the policy as it is now, of its adjoint, too."""
         inputs, graph = self.inputs(_FEW), torch.is_grad_enabled()
-        told = digest(self.act, inputs, PolicyRows.simpler, gradients=graph)
-        return told + (digest(self.pulled, self.seeded(inputs), PolicyRows.simpler) if graph else b"")
+        forwards = digest(self.act, inputs, PolicyRows.simpler, gradients=graph)
+        return forwards + (digest(self.pulled, self.seeded(inputs), PolicyRows.simpler) if graph else b"")
 
 
 def _tried(policy: nn.Module, inputs: Mapping[str, Tensor], actions: int) -> None:
@@ -176,19 +176,19 @@ def driver_of(policy: Any, seen: Tensor, actions: int, hidden: Tensor | None = N
         while len(drivers) >= _MOST:
             del drivers[next(iter(drivers))]
         drivers[key] = None
-        made = Driver(policy, rows, width, actions, dtype, memory)
+        driver = Driver(policy, rows, width, actions, dtype, memory)
         if graph:
-            _ = made.backward
+            _ = driver.backward
         if _Recording(policy, width, actions, dtype, memory).digest() != key[1]:
             drivers[form] = None  # it changes by being called
             return None
-        drivers[key] = made
+        drivers[key] = driver
     except Untraceable:
         return None
     except Exception:  # a policy may raise anything at inputs that it does not take; between the steps that is told
         _tried(policy, {"seen": seen} | ({} if hidden is None else {"hidden": hidden}), actions)
         return None
-    return made
+    return driver
 
 
 class _Segment(NamedTuple):

@@ -70,7 +70,7 @@ class Place(NamedTuple):
 
 
 class _Recorder(Uncompiled, TorchDispatchMode):
-    """Keeps every operation with what went in and what came out."""
+    """Keeps every operation with its inputs and its results."""
 
     def __init__(self, simpler: Mapping[Any, Callable[..., Any]]) -> None:
         super().__init__()
@@ -92,7 +92,11 @@ def recorded(
     function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor],
     simpler: Mapping[Any, Callable[..., Any]],
 ) -> tuple[list[tuple[str, tuple[Any, ...], dict[str, Any], Any]], dict[str, Tensor]]:  # fmt: skip
-    """Return the operations of one call of a function, and what it returns. Untraceable where it asks for chance."""
+    """Return the operations of one call of a function of tensors of any shape, and its result.
+
+    Raises:
+        Untraceable: For a function that draws random numbers.
+    """
     with torch.no_grad(), recording(), _Recorder(simpler) as recorder:
         results = dict(function(**inputs))
     return recorder.calls, results
@@ -130,18 +134,18 @@ class RowFunction:
         self._tables: list[np.ndarray] = []
         self._table_of: dict[int, str] = {}
         self._parts: list[list[str]] = []
-        made, results = recorded(function, inputs, self.simpler)
+        operations, results = recorded(function, inputs, self.simpler)
         self._floats = next(x.dtype for x in (*inputs.values(), *results.values()) if x.is_floating_point())
         for name, x in inputs.items():
             self._given(name, x)
         self._blanks: dict[int, float] = {}
-        for called, args, _, out in made:
+        for called, args, _, out in operations:
             if called in _BLANK:
                 self._blanks[storage(out)] = _BLANK[called]
             elif called in _FULL:
                 self._blanks[storage(out)] = args[_FULL[called]]
-        _refuse_forks(made, list(inputs.values()))
-        calls = _needed(made, list(results.values()))
+        _refuse_forks(operations, list(inputs.values()))
+        calls = _needed(operations, list(results.values()))
         self._calls = calls
         for call in calls:
             self._print(*call)

@@ -1,4 +1,4 @@
-"""What a function of tensors does, as a digest: two recordings with the same digest print the same loops.
+"""A function of tensors as a digest of its operations: two recordings with the same digest print the same loops.
 
 A function may read whatever it likes: numbers, flags, hooks, globals. Only what it *does* with its inputs says whether
 loops that were printed earlier are still it. Recorded on few rows, that costs as much as calling it some times.
@@ -20,7 +20,9 @@ def digest(
     function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor],
     simpler: Mapping[Any, Callable[..., Any]], *, gradients: bool = False,
 ) -> bytes:  # fmt: skip
-    """Return a digest of all that ``function(**inputs)`` does, and of every constant that it reads.
+    """Return the digest (16 bytes) of the operations of ``function(**inputs)``, and of every constant that it reads.
+
+    ``inputs`` are tensors of any shape by name; ``simpler`` replaces operations, as in ``RowFunction``.
 
     Raises:
         Untraceable: With ``gradients``, for a tensor that requires one and is no input: loops would lose it.
@@ -37,13 +39,13 @@ def digest(
             parts.append(")")
         elif isinstance(x, Tensor):
             parts.append(f"{x.dtype}{tuple(x.shape)}{x.stride()}{x.storage_offset()}")
-            known = number.get(storage(x))
-            if known is None:
+            label = number.get(storage(x))
+            if label is None:
                 if gradients and x.requires_grad:
                     raise Untraceable("a tensor that requires a gradient and is no parameter")
-                known = number[storage(x)] = f"constant {len(number)}"
+                label = number[storage(x)] = f"constant {len(number)}"
                 parts.append(x.detach().cpu().contiguous().numpy().tobytes())
-            parts.append(known)
+            parts.append(label)
         else:
             parts.append(repr(x))
 
