@@ -333,8 +333,9 @@ def shown(
     chosen: dict[str, Any] = {**environment, "warmup_pool": 0, "max_episode_steps": -1, **keywords}
     task = task_of(environment)
     if isinstance(task, RingTask):
-        # Shocks come as long after the policy has taken over as in the test.
-        chosen |= {"length": 250.0, "shock_after": [x + human * task.step_time for x in task.shocks]}
+        chosen["length"] = 250.0
+        if task.shocks:  # they come as long after the policy has taken over as in the test
+            chosen["shock_after"] = [x + human * task.step_time for x in task.shocks]
     env = DiffIDMEnv(**chosen)
     observation, _ = env.reset(seed=seed)
     past = None

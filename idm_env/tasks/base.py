@@ -72,7 +72,7 @@ class Task(abc.ABC):
             who brakes as hard, or where its lane ends, are cut, and may then brake beyond ``max_command``; 0 is none.
             Rewards are for the command as it was given. See ``idm_env.tasks.failsafe.safe_accel``.
         failsafe_time: Time (s) that the failsafe allows for before braking begins, as SUMO's tau.
-        hold: Time (s) for which an action is held: a step of the environment is so long, and its reward the sum over
+        hold: Time (s) for which an action is held: a step of the environment is so long, and its reward the mean over
             it; a whole number of Δt. None is the task's own: one Δt, or 1 s where vehicles enter and leave.
         max_episode_steps: Steps of the environment after which an episode is cut off; None is the task's own number, −1
             is no limit.

@@ -34,7 +34,7 @@ def test_in_free_traffic_what_comes_goes(short):
 def test_the_return_that_is_judged_is_the_environments(monkeypatch, more):
     """A rollout between two decisions pays what the steps of an environment pay, human drivers or agents."""
     monkeypatch.setattr(evaluate, "STEPS_OF_LANES", 150)
-    chosen = {"task": "merge", "vehicles": 30, **more}
+    chosen = {"task": "merge", "vehicles": 30, "reward": "delay", **more}
     commands = -torch.ones(2, 6 if "lane_commands" in more else 3)
     for act in (None, lambda seen: commands):
         found = evaluate.evaluate_lanes(act, chosen, 2)
