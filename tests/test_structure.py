@@ -229,7 +229,7 @@ def top_level() -> set[str]:
         (arrows, 174),
         (circles, 0),
         (classes_named_twice, 7),
-        (lines_of_code, 36400),
+        (lines_of_code, 36450),
         (functions_of_many_parameters, 21),
         (high_packages, 1),
         (file_names_twice, 25),

@@ -65,12 +65,13 @@ def load(
 def files_of(paths: Sequence[Path]) -> list[Path]:
     """Return the files that paths, folders and patterns such as ``drives/*.csv`` name, in order, each once.
 
-    DataError for a folder or a pattern without a file.
+    A ``.txt`` beside other data in a folder is taken for notes. DataError for a folder or a pattern without a file.
     """
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
             some = sorted(p for p in path.iterdir() if p.name.lower().endswith(EXTENSIONS) and p.is_file())
+            some = [p for p in some if p.suffix.lower() != ".txt"] or some
         elif path.exists() or not glob.has_magic(str(path)):
             some = [path]
         else:

@@ -45,6 +45,23 @@ def ranking(this: Round) -> Figure:
     return figure
 
 
+def absorption(d: Discovery) -> Figure | None:
+    """Bars of the absorbed share."""
+    shares = [
+        (c.absorbed_share, words.plain(c.effect)) for c in d.result.candidates
+        if c.round == 1 and c.named and c.absorbed_share is not None
+    ]  # fmt: skip
+    if not shares:
+        return None
+    shares.sort(key=lambda x: x[0])
+    figure, axes = plt.subplots(layout="constrained", figsize=(7.2, 0.22 * len(shares) + 0.9))
+    axes.barh(range(len(shares)), [100 * share for share, _ in shares], color=GREY)
+    axes.set_yticks(range(len(shares)), [name for _, name in shares])
+    axes.set_xlim(0, 100)
+    axes.set_xlabel("absorbed by re-calibration (%)")
+    return figure
+
+
 def _projected(d: Discovery, scored: Any) -> np.ndarray | None:
     solution = scored.solution
     if solution is None or not solution.linear.by_phi.shape[-1]:
@@ -89,6 +106,30 @@ def look_alikes(d: Discovery) -> Figure | None:
             if i != j and abs(cosine[i, j]) > 0.4:
                 axes.text(j, i, f"{cosine[i, j]:.1f}", ha="center", va="center", fontsize=6)
     figure.colorbar(image, shrink=0.8)
+    return figure
+
+
+def added_variable(d: Discovery) -> Figure | None:
+    """Scatter of the residual against the winner's response, per window."""
+    this = d.rounds[0]
+    if this.winner is None:
+        return None
+    scored = this.scored[this.winner]
+    column = _projected(d, scored)
+    if column is None:
+        return None
+    residual = _off(d, d.null.linear.by_theta, d.problem.residual(
+        d.problem.errors(d.null.theta[None], d.null.model, d.null.values[None])
+    )[0])  # fmt: skip
+    x, y = (column**2).sum(1) ** 0.5 * np.sign(column[:, -1]), -(residual * column).sum(1)
+    y = y / np.maximum((column**2).sum(1) ** 0.5, 1e-9) * np.sign(column[:, -1])
+    figure, axes = plt.subplots(layout="constrained", figsize=(5.4, 3.6))
+    axes.plot(x, y, ".", ms=2.5, color=AFTER, alpha=0.5)
+    slope = float((x * y).sum() / max((x * x).sum(), 1e-12))
+    reach = np.array([x.min(), x.max()])
+    axes.plot(reach, slope * reach, color=BEFORE, lw=1.2)
+    axes.set_xlabel(f"response to {words.plain(scored.term.label)} (in units of noise)")
+    axes.set_ylabel("residual along it")
     return figure
 
 
@@ -224,6 +265,29 @@ def named(d: Discovery) -> list[tuple[str, Judged, str, str]]:
     if judgement.compared is not None and judgement.after is not None:
         models.append((titles[1], judgement.after, AFTER, "--"))
     return models
+
+
+def first_screen(d: Discovery, size: tuple[float, float] = (9.0, 4.0)) -> Figure | None:
+    """Measured and simulated gap of the typical follower over time, and the residual of both models below."""
+    follower = typical(d)
+    if follower is None:
+        return None
+    figure, (above, below) = plt.subplots(2, 1, figsize=size, sharex=True, height_ratios=(3, 2), layout="constrained")
+    handles = []
+    for i, (name, judged, colour, style) in enumerate(named(d)):
+        time, measured, simulated = _trace(judged, follower)
+        if not i:
+            handles += above.plot(time, measured, color=TRUTH, lw=1.5, label="measured")
+        label = f"{name}: {judged.gap_rmse[follower]:.2f} m"
+        handles += above.plot(time, simulated, color=colour, ls=style, lw=1.1, label=label)
+        below.plot(time, simulated - measured, color=colour, ls=style, lw=1.1)
+    below.axhline(0, color=TRUTH, lw=0.6)
+    above.set_ylabel("gap (m)")
+    below.set_ylabel("residual (m)")
+    below.set_xlabel("time (s)")
+    columns = len(handles) if size[0] > 6 else 1
+    figure.legend(handles=handles, loc="outside upper left", ncols=columns)
+    return figure
 
 
 def gaps(d: Discovery) -> Figure | None:

@@ -263,8 +263,10 @@ def break_losses(monkeypatch, update: int) -> None:
 
 def break_rewards(monkeypatch) -> None:
     """Make all rewards NaN."""
-    plain = RingTask.rewards
-    monkeypatch.setattr(RingTask, "rewards", lambda self, *given: plain(self, *given) * torch.nan)
+    plain = RingTask.reward_parts
+    monkeypatch.setattr(
+        RingTask, "reward_parts", lambda self, *given: {n: x * torch.nan for n, x in plain(self, *given).items()}
+    )
 
 
 @pytest.mark.parametrize("name", AGENTS)
