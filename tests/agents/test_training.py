@@ -559,8 +559,10 @@ def test_the_gain_values_last_scenes_and_cuts_gradients_at_resets(ring):
             pushes.append(torch.full((2, 1), 0.2, requires_grad=True))
             return pushes[-1]
 
-    plain = env.batch.task.rewards
-    object.__setattr__(env.batch.task, "rewards", lambda *x: 0.0 * plain(*x))
+    plain = env.batch.task.reward_parts
+    object.__setattr__(
+        env.batch.task, "reward_parts", lambda *x: {name: 0.0 * part for name, part in plain(*x).items()}
+    )
 
     window = shac.roll(env, shac.Sighted(Push(), 1), Ends(), a)
     assert window.ended[:, 0].tolist() == [t == 5 for t in range(8)]
