@@ -18,7 +18,7 @@ LOOPS = [
     {"lane": 2, "place": 395.0, "name": "before the drop", "every": 8.0},
 ]
 JAM = {"task": "bottleneck", "vehicles": 60, "inflow": 6000.0, "detectors": LOOPS}
-STEPS = 400
+STEPS = 560
 
 
 def by_hand(states):
