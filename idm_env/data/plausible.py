@@ -5,6 +5,7 @@ Of 1.57 million rows of six measured sets none moves faster than 70 m/s, and non
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
@@ -26,6 +27,8 @@ MISSING = (-1.0, 0.0, *(sign * value for value in (999.0, 9999.0, 99999.0, 99999
 MOST_ROWS, MOST_FALLS, MOST_LEAPS, MOST_OVERLAPS, MOST_BLIND = 0.05, 0.1, 0.5, 0.02, 0.2
 """Shares above which a file is refused: of rows that jump, of tracks that fall or leap for good, and of rows with a
 leader that overlap by their positions, or have a measured gap that is none."""
+FEW_VEHICLES = 10
+"""Of so many vehicles one alone can be wrong; of fewer, one that overlaps is taken for one of another lane."""
 
 
 @dataclass
@@ -144,29 +147,41 @@ class Jumps:
 
 @dataclass
 class Overlaps:
-    """In how many rows with a leader the gap is not positive, over all pieces of a file."""
+    """In how many rows with a leader the gap is not positive, over all pieces of a file, and who is in them."""
 
     rows: int = 0
     overlaps: int = 0
     measured: int = 0
     laned: bool = False
+    among: Counter[tuple[str, str]] = field(default_factory=Counter)
 
     def add(self, gaps: pl.DataFrame) -> None:
         """Count rows with the columns gap_m and gap_measured."""
         self.rows += gaps.height - gaps["gap_m"].null_count()
-        overlap = (gaps["gap_m"] <= 0.0).fill_null(False)
-        self.overlaps += int(overlap.sum())
-        self.measured += int((overlap & gaps["gap_measured"]).sum())
+        overlap = gaps.filter(pl.col("gap_m") <= 0.0)
+        self.overlaps += overlap.height
+        self.measured += int(overlap["gap_measured"].sum())
         self.laned |= "lane" in gaps.columns and gaps["lane"].null_count() < gaps.height
+        for who in ("vehicle_id", "leader_id"):
+            for run, vehicle, count in overlap.filter(~pl.col("gap_measured")).group_by("run_id", who).len().rows():
+                self.among[run, vehicle] += count
 
-    def check(self, source: str) -> None:
-        """Raise DataError where so many bodies are in one place that they cannot be on one lane."""
+    def check(self, source: str, vehicles: int) -> list[Repair]:
+        """Return what is to be said of one of so many vehicles, without which the others hardly overlap.
+
+        DataError where so many bodies are in one place that they cannot be on one lane.
+        """
         if self.measured > MOST_BLIND * self.rows:
             many = f"{self.measured} of {self.rows} rows"
             raise DataError(f"{source}: gap_m is not above 0 in {many}; leave it empty where nobody is seen.")
         overlaps = self.overlaps - self.measured
         if overlaps < 3 or overlaps <= MOST_OVERLAPS * self.rows:
-            return
+            return []
+        (run, _), count = self.among.most_common(1)[0]
+        if vehicles >= FEW_VEHICLES and overlaps - count <= MOST_OVERLAPS * self.rows:
+            who = " or ".join(sorted(vehicle for (_, vehicle), n in self.among.items() if n == count)[:2])
+            words = f"rows overlap with vehicle {who} of run {run}: are its length, position and lane right?"
+            return repaired("one vehicle overlaps", count, words)
         ask = "are the lanes of one road" if self.laned else "is a lane missing"
         many = f"vehicles overlap in {overlaps} of {self.rows} rows"
         raise DataError(f"{source}: {many}: {ask}, or is position_m one of two coordinates?")

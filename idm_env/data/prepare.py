@@ -73,7 +73,7 @@ def prepare(
     frame = then(leaders.gaps(frame, source))
     overlaps = plausible.Overlaps()
     overlaps.add(frame)
-    overlaps.check(source)
+    done += overlaps.check(source, frame.select(schema.TRACK).n_unique())
     if frame["leader_id"].null_count() == frame.height:
         raise DataError(f"{source}: nobody follows anybody; two vehicles must share a run and a lane at one time.")
     return schema.check(_arranged(frame), source), steps, done

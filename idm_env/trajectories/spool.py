@@ -206,7 +206,7 @@ class Spool:
             files.append(self.folder / f"led-{bucket:05d}.parquet")
             storage.write(files[-1], frame.select(*TRACK, "chunk", "step", "leader_id").write_parquet)
             _remove(parts)
-        overlaps.check(self.source)
+        self._counted.add(overlaps.check(self.source, vehicles.height))
         by_chunk = self._partition(files, "led", pl.col("chunk"))
         followers = 0
         for chunk, parts in by_chunk.items():

@@ -131,6 +131,16 @@ def test_bodies_in_one_place_are_asked_about(tmp_path: Path) -> None:
     assert told.endswith("overlap in 12 of 24 rows: is a lane missing, or is position_m one of two coordinates?")
 
 
+def test_one_vehicle_that_overlaps_does_not_count_the_file_out(tmp_path: Path) -> None:
+    many = table(tuple(900.0 - 30.0 * n for n in range(12)))
+    longer = pl.when(pl.col("vehicle_id") == 7).then(29.5).otherwise(4.5)
+    behind = pl.when(pl.col("vehicle_id") == 7).then(pl.col("position_m") - 28.0).otherwise("position_m")
+    for wrong in (many.with_columns(length_m=longer, position_m=behind), many.with_columns(position_m=behind)):
+        wrong.write_csv(tmp_path / "a.csv")
+        (said,) = (r for r in read_alike(tmp_path / "a.csv", tmp_path).repairs if r.kind == "one vehicle overlaps")
+        assert said.text == "6 rows overlap with vehicle 7 or 8 of run 0: are its length, position and lane right?"
+
+
 def test_no_measured_file_is_alarmed_about(measured: Callable[[str], Path]) -> None:
     names = [
         "highsim_i75_lanes.parquet", "ngsim_i80_lanes.parquet", "ngsim_i80_pairs.parquet", "ngsim_i80_rawlike.csv.gz",

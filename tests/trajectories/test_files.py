@@ -107,12 +107,16 @@ def test_bad_tracks_are_counted_and_the_others_done(tmp_path: Path) -> None:
         "shuffled": (time[::-1], 10 * time[::-1]),
         "double": (np.repeat(time, 2), np.repeat(10 * time, 2)),
     }
-    frames = [pl.DataFrame({"vehicle_id": name, "time_s": t, "position_m": x}) for name, (t, x) in rows.items()]
+    # 200 m apart: where all begin at one place they overlap, and the file is asked about its lanes
+    frames = [
+        pl.DataFrame({"vehicle_id": name, "time_s": t, "position_m": x + 200.0 * n})
+        for n, (name, (t, x)) in enumerate(rows.items())
+    ]
     pl.concat(frames).write_parquet(tmp_path / "bad.parquet")
     report = files.filter_file(tmp_path / "bad.parquet", tmp_path / "out")
     assert {item["track"] for item in report["left_out"]} == {"0/point", "0/reverse/0"}
     assert {item["kind"] for item in report["repairs"]} == {
-        "time not increasing", "duplicated time", "length assumed", "leaders derived", "leader flickers",
+        "time not increasing", "duplicated time", "length assumed", "leaders derived", "leader flickers", "track split",
     }  # fmt: skip
     assert report["tracks"] == 7  # the jump makes two
     table = pl.read_parquet(tmp_path / "out" / "trajectories.parquet")

@@ -30,21 +30,24 @@ TIME = np.arange(0, 10.0, 0.1)
 def test_one_bad_track_does_not_stop_the_others() -> None:
     frame = pl.concat(
         [
-            rows("good", TIME, 10 * TIME),
-            rows("point", np.array([1.0]), np.array([5.0])),
-            rows("two", np.array([0.0, 1.0]), np.array([0.0, 9.0])),
-            rows("parked", TIME, 0 * TIME),
-            rows("backwards", TIME, 25 - np.abs(5 * TIME - 25)),
-            rows("jump", TIME, 10 * TIME + 100.0 * (TIME > 4.95)),
-            rows("spike", TIME, 10 * TIME + 100.0 * (np.abs(TIME - 5) < 0.01)),
+            rows("good", TIME, 10 * TIME, lane=1),
+            rows("point", np.array([1.0]), np.array([5.0]), lane=2),
+            rows("two", np.array([0.0, 1.0]), np.array([0.0, 9.0]), lane=3),
+            rows("parked", TIME, 0 * TIME, lane=4),
+            rows("backwards", TIME, 25 - np.abs(5 * TIME - 25), lane=5),
+            rows("jump", TIME, 10 * TIME + 100.0 * (TIME > 4.95), lane=6),
+            rows("spike", TIME, 10 * TIME + 100.0 * (np.abs(TIME - 5) < 0.01), lane=7),
         ]
     )
-    pieces = Pieces(read_frame(frame))
+    table = read_frame(frame)
+    counts = {repair.kind: repair.count for repair in table.repairs}
+    assert counts["track split"] == counts["position jumps"] == 1
+    pieces = Pieces(table)
     tracks = {track.key: track for track in pieces}
-    assert sorted(tracks) == ["0/good/0", "0/jump/0", "0/jump/1", "0/parked/0", "0/spike/0", "0/two/0"]
+    assert sorted(tracks) == ["0/good/0", "0/jump.1/0", "0/jump/0", "0/parked/0", "0/spike/0", "0/two/0"]
     assert {name: why.split()[0] for name, why in pieces.left_out} == {"0/point": "a", "0/backwards/0": "drives"}
-    assert pieces.notes == [("0/jump", "divided into 2 tracks at holes or jumps")]
-    assert len(tracks["0/jump/0"]) == len(tracks["0/jump/1"]) == 50
+    assert not pieces.notes
+    assert len(tracks["0/jump/0"]) == len(tracks["0/jump.1/0"]) == 50 and len(tracks["0/spike/0"]) == 99
 
 
 def test_times_are_sorted_and_repeats_counted() -> None:
