@@ -16,15 +16,11 @@ from idm_env.data.schema import REQUIRED, TIDY
 
 LENGTHS = {"m": 1.0, "ft": 0.3048, "feet": 0.3048, "km": 1000.0, "mi": 1609.344, "cm": 0.01, "mm": 0.001}
 TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
-SPEEDS = {
-    "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "mph": 0.44704, "ft/s": 0.3048,
-    "fps": 0.3048, "ftps": 0.3048, "cm/s": 0.01, "mm/s": 0.001,
-}  # fmt: skip
+SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": 0.3048, "cm/s": 0.01, "mm/s": 0.001}
+SPEEDS |= {"mps": 1.0, "kmh": 1 / 3.6, "kph": 1 / 3.6, "fps": 0.3048, "ftps": 0.3048}
 ACCELERATIONS = {"m/s2": 1.0, "m/s^2": 1.0, "m/s²": 1.0, "mps2": 1.0, "ft/s2": 0.3048, "ft/s^2": 0.3048, "g": 9.80665}
-UNITS: dict[str, dict[str, float]] = {
-    "time_s": TIMES, "position_m": LENGTHS, "speed_mps": SPEEDS, "accel_mps2": ACCELERATIONS, "length_m": LENGTHS,
-    "gap_m": LENGTHS, "ring_length_m": LENGTHS,
-}  # fmt: skip
+UNITS: dict[str, dict[str, float]] = {"time_s": TIMES, "speed_mps": SPEEDS, "accel_mps2": ACCELERATIONS}
+UNITS |= dict.fromkeys(("position_m", "length_m", "gap_m", "ring_length_m"), LENGTHS)
 """Units by column, and what they are multiplied by."""
 SHORT = {re.sub(r"_(id|s|m|mps2?)$", "", name): name for name in (*TIDY, *UNITS)}
 """``time`` for ``time_s``, and so on."""

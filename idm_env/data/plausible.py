@@ -163,8 +163,8 @@ class Overlaps:
         self.measured += int(overlap["gap_measured"].sum())
         self.laned |= "lane" in gaps.columns and gaps["lane"].null_count() < gaps.height
         for who in ("vehicle_id", "leader_id"):
-            for run, vehicle, count in overlap.filter(~pl.col("gap_measured")).group_by("run_id", who).len().rows():
-                self.among[run, vehicle] += count
+            for run, vehicle, some in overlap.filter(~pl.col("gap_measured")).group_by("run_id", who).len().rows():
+                self.among[run, vehicle] += some
 
     def check(self, source: str, vehicles: int) -> list[Repair]:
         """Return what is to be said of one of so many vehicles, without which the others hardly overlap.
@@ -177,11 +177,11 @@ class Overlaps:
         overlaps = self.overlaps - self.measured
         if overlaps < 3 or overlaps <= MOST_OVERLAPS * self.rows:
             return []
-        (run, _), count = self.among.most_common(1)[0]
-        if vehicles >= FEW_VEHICLES and overlaps - count <= MOST_OVERLAPS * self.rows:
-            who = " or ".join(sorted(vehicle for (_, vehicle), n in self.among.items() if n == count)[:2])
+        (run, _), most = self.among.most_common(1)[0]
+        if vehicles >= FEW_VEHICLES and overlaps - most <= MOST_OVERLAPS * self.rows:
+            who = " or ".join(sorted(vehicle for (_, vehicle), n in self.among.items() if n == most)[:2])
             words = f"rows overlap with vehicle {who} of run {run}: are its length, position and lane right?"
-            return repaired("one vehicle overlaps", count, words)
+            return repaired("one vehicle overlaps", most, words)
         ask = "are the lanes of one road" if self.laned else "is a lane missing"
         many = f"vehicles overlap in {overlaps} of {self.rows} rows"
         raise DataError(f"{source}: {many}: {ask}, or is position_m one of two coordinates?")
