@@ -9,6 +9,7 @@ from typing import Any
 from idm_env.extras import needed
 
 with needed("the command line"):
+    import typer
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -114,6 +115,13 @@ def citations(effects: dict[str, Any]) -> list[str]:
     bare = [name for name, cls in effects.items() if not cls.sources]
     lines = [f"{source} [{', '.join(names)}]" for source, names in sorted(by_source.items())]
     return [*lines, *([f"Without a publication of their own: {', '.join(bare)}."] if bare else [])]
+
+
+def end_failed(why: str) -> None:
+    """End with code 1 and one red line where work ended with nothing to rely on."""
+    if why:
+        console.print(Text(f"error: {why}", style="bold red"), soft_wrap=True)
+        raise typer.Exit(1)
 
 
 def written(word: str, path: Path) -> None:

@@ -342,7 +342,7 @@ def fit(
         )  # fmt: skip
         with job.running(report) as run:
             result = fit_file(source, options, job.out, **run)
-        if sumo is not None:
+        if sumo is not None and not result["failed"]:
             vtypes.write(sumo, load_model(job.out / "model.yaml"))
     if result["over_fitting"]:
         console.print(result["over_fitting"], soft_wrap=True, highlight=False)
@@ -352,6 +352,7 @@ def fit(
     answers.show("Errors in free simulation", in_words(rows))
     console.print(result["at_bounds"], soft_wrap=True, highlight=False)
     answers.finished(job.out, result["data"]["account"])
+    answers.end_failed(result["failed"])
 
 
 def _only(context: typer.Context, mode: str, accepted: set[str]) -> None:

@@ -142,6 +142,26 @@ def over_fitting(rows: list[dict[str, Any]], fitted: float, held_out: float | No
     return f"Over-fitting: {', and '.join(signs)}. {cure}, or with a prior (idm_env.fitting.fit.fit(prior=...))."
 
 
+def failure(rows: list[dict[str, Any]], error: Errors) -> str:
+    """Return in what a fit failed, and what to look at; nothing where it did not.
+
+    It failed where most stretches collide, the median gap RMSE is above the median gap, or above half of it with most
+    estimates on bounds, or four of five are. Three of five alone are no failure: so it is of all NGSIM pairs together.
+    """
+    on, total = sum(n for _, n in _on_bounds(rows)), len(rows) * rows[0]["groups"]
+    collisions, count = int((error.smallest_gap <= 0).sum()), len(error.gap_rmse)
+    rmse, gap = float(error.gap_rmse.median()), float(error.measured_gap.median())
+    signs = []
+    if len(rows) > 2 and (5 * on >= 4 * total or (2 * on > total and 2 * rmse > gap)):
+        signs.append(f"{on} of {total} estimates are on bounds")
+    if 2 * collisions > count:
+        signs.append(f"{collisions} of {count} stretches collide")
+    if rmse > gap:
+        signs.append(f"the gap RMSE is {rmse:.3g} m, and the gap {gap:.3g} m (medians)")
+    cure = "Check leaders, lanes, units and clocks of the file; model.yaml is not written."
+    return f"The fit failed: {', and '.join(signs)}. {cure}" if signs else ""
+
+
 def blocks(estimates: Estimates, rows: Sequence[dict[str, Any]], shares: list[dict[str, Any]]) -> list[page.Block]:
     """Return the table of parameters with their shares at bounds, and the table of drivers.
 

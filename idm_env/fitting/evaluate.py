@@ -15,12 +15,16 @@ from idm_env.fitting.problem import Problem, Simulated, group_of
 
 
 class Errors(NamedTuple):
-    """Per episode [rows]: root mean square and mean absolute gap error (m), speed RMSE (m/s), smallest gap (m)."""
+    """Per episode [rows]: RMSE and mean absolute error of the gap (m), speed RMSE (m/s), smallest gap (m).
+
+    ``measured_gap`` is the mean gap in the record (m).
+    """
 
     gap_rmse: Tensor
     gap_mae: Tensor
     speed_rmse: Tensor
     smallest_gap: Tensor
+    measured_gap: Tensor
 
     def summary(self) -> dict[str, float]:
         """Return means over episodes, the median gap RMSE, and how many episodes end in a collision."""
@@ -53,6 +57,7 @@ def errors(problem: Problem, own: Tensor, shared: Tensor) -> tuple[Errors, Simul
             gap.abs().sum(0) / count,
             (speed.square().sum(0) / count).sqrt(),
             smallest,
+            (problem.batch.gap[1:] * weight).sum(0) / weight.sum(0),
         ),
         simulated,
     )

@@ -51,7 +51,8 @@ def fit_file(
     """Fit IDM, or another car-following law, to a file and return the report; write it, the parameters and the model.
 
     Writes ``parameters.parquet`` (one row per group and parameter), ``drivers.csv`` (one row per group),
-    ``model.yaml`` (without drivers of its own above ``MOST_DRIVERS``), ``report.json`` and ``report.html``.
+    ``model.yaml`` (without drivers of its own above ``MOST_DRIVERS``), ``report.json`` and ``report.html``. A fit that
+    failed (``failed`` of the report says in what) has no model.
 
     The work is done in parts of ``part`` groups by ``executor`` (None: here), on which no byte of the first three
     depends. The path may be a folder of parquet files with columns run_id, vehicle_id, time_s and position_m at least:
@@ -144,6 +145,7 @@ def _write(
     out, options, estimates = work.out, work.options, joined.estimates
     error = joined.errors.summary()
     bounds, many = drivers.bounds(estimates), len(estimates.groups) > drivers.MOST_ROWS
+    failed = drivers.failure(bounds, joined.errors)
     result: dict[str, Any] = {
         "schema": 1,
         "command": page.command_line(),
@@ -156,6 +158,7 @@ def _write(
             "iterations": joined.iterations,
         },
         "held_out": held_out,
+        "failed": failed,
         "at_bounds": drivers.sentence(bounds),
         "over_fitting": drivers.over_fitting(
             bounds, error["gap_rmse_m"], None if held_out is None else held_out["gap_rmse_m"], options.by
@@ -174,7 +177,10 @@ def _write(
     model = dataclasses.replace(model_of(estimates, options.by), substeps=options.substeps)
     if len(estimates.groups) <= MOST_DRIVERS:
         model = dataclasses.replace(model, fitted_on={"source": data["source"], "tracks": sorted(set(tracks))})
-    save_model(out / "model.yaml", model)
+    if failed:
+        (out / "model.yaml").unlink(missing_ok=True)  # of an earlier fit
+    else:
+        save_model(out / "model.yaml", model)
     storage.write_json(out / "report.json", result)
     title = f"{estimates.simulator.base.title} fitted to {data['source']}"
     page.write_page(out / "report.html", title, _fit_page(result, joined, table))
@@ -244,6 +250,7 @@ def _fit_page(result: dict[str, Any], joined: JoinedFit, table: list[dict[str, A
     )
     titles = ("Measured and simulated", "Residuals", "In space and time")
     return [
+        *([page.lead(result["failed"])] if result["failed"] else []),
         page.lead(lead),
         *([page.lead(result["over_fitting"])] if result["over_fitting"] else []),
         page.text(result["at_bounds"]),

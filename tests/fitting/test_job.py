@@ -6,14 +6,18 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pytest
+import torch
 
 from idm_env.data import synthetic
-from idm_env.fitting.drivers import over_fitting
+from idm_env.fitting.drivers import failure, over_fitting
+from idm_env.fitting.evaluate import Errors
 from idm_env.fitting.job import FITTED, fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
 from idm_env.model_file import load_model
+from tests.commands import run
 
 
 @pytest.fixture(scope="module")
@@ -203,3 +207,39 @@ def test_simulate_says_what_the_model_was_fitted_on(file: Path, tmp_path: Path) 
         if count == 6:
             assert f"On the others it is {result['fitted_on']['gap_rmse_of_others_m']:.2f} m." in page
             assert result["fitted_on"]["gap_rmse_of_others_m"] != pytest.approx(result["error"]["gap_rmse_m"])
+
+
+def test_a_fit_that_failed_ends_with_code_1_and_without_a_model(file: Path, tmp_path: Path) -> None:
+    """Gaps that nobody can have kept: they are drawn anew in every row; a model of before is not left as if it were."""
+    out, bad, vtypes = tmp_path / "out", tmp_path / "bad.csv", tmp_path / "vtypes.add.xml"
+    options = ("--starts", 1, "--by", "all", "--out", out, "--sumo", vtypes)
+    assert run("fit", file, *options)[0] == 0
+    assert (out / "model.yaml").exists()
+    vtypes.unlink()
+    table = pl.read_csv(file)
+    drawn = 10 ** pl.Series(np.random.default_rng(0).uniform(-0.5, 1.8, table.height))
+    table.with_columns(gap_m=pl.when(pl.col("leader_id").is_not_null()).then(drawn)).write_csv(bad)
+    code, said = run("fit", bad, *options)
+    (line,) = (line for line in said.splitlines() if line.startswith("error: "))
+    assert code == 1 and "8 of 8 stretches collide" in line, said
+    assert json.loads((out / "report.json").read_text())["failed"] in line
+    assert "The fit failed: " in (out / "report.html").read_text()
+    assert not (out / "model.yaml").exists() and not vtypes.exists()
+
+
+@pytest.mark.parametrize(
+    ("on", "rmse", "smallest", "words"),
+    [
+        (3, 2.5, 0.1, ""),  # all pairs of NGSIM together
+        (3, 6.0, 0.1, "3 of 5 estimates are on bounds"),
+        (4, 2.5, 0.1, "4 of 5 estimates are on bounds"),
+        (0, 10.1, 0.1, "the gap RMSE is 10.1 m, and the gap 10 m"),
+        (0, 2.5, -0.1, "2 of 2 stretches collide"),
+    ],
+)
+def test_what_a_failed_fit_is(on: int, rmse: float, smallest: float, words: str) -> None:
+    two = torch.ones(2)
+    error = Errors(rmse * two, two, two, smallest * two, 10.0 * two)
+    rows = [row(f"parameter {n}", int(n < on), 1) for n in range(5)]
+    told = failure(rows, error)
+    assert words in told and bool(told) == bool(words)
