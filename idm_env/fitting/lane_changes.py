@@ -12,18 +12,7 @@ import torch
 from idm_env.data import DataError, Trajectories
 from idm_env.data.errors import by_kind
 from idm_env.effects import IDM, Brakes, Mobil, base_named
-from idm_env.fitting.discrete_choice import (
-    Choice,
-    Chosen,
-    ConstantRate,
-    GapLogit,
-    HeldOut,
-    UtilityLogit,
-    fit_choice,
-    folds,
-    held_out,
-    per_vehicle,
-)
+from idm_env.fitting import discrete_choice
 from idm_env.fitting.lane_decisions import Decisions, recorded_decisions
 from idm_env.fitting.options import Source
 from idm_env.jobs import storage
@@ -63,12 +52,12 @@ class LaneChanges(NamedTuple):
     """Decisions, the models fitted to them (MOBIL first), and what each of them says of drivers it has not seen."""
 
     decisions: Decisions
-    fitted: tuple[Chosen, ...]
-    held_out: tuple[HeldOut, ...]
+    fitted: tuple[discrete_choice.Chosen, ...]
+    held_out: tuple[discrete_choice.HeldOut, ...]
     model: Model
 
     @property
-    def mobil(self) -> Chosen:
+    def mobil(self) -> discrete_choice.Chosen:
         """The fit of the effects."""
         return self.fitted[0]
 
@@ -76,7 +65,7 @@ class LaneChanges(NamedTuple):
         """Return one row per model: log-likelihoods, and by how much MOBIL's is larger on unseen drivers."""
         rows = []
         for chosen, seen in zip(self.fitted, self.held_out, strict=True):
-            ahead = per_vehicle(self.decisions, self.held_out[0].log_likelihood - seen.log_likelihood)
+            ahead = discrete_choice.per_vehicle(self.decisions, self.held_out[0].log_likelihood - seen.log_likelihood)
             rows.append({
                 "model": chosen.model.title, "parameters": len(chosen.theta), "fitted": chosen.log_likelihood,
                 "held_out": float(seen.log_likelihood.sum()), "mobil_gains": float(ahead.sum()),
@@ -120,16 +109,17 @@ def lane_changes(
         first_lane=options.first_lane,
     )  # fmt: skip
     free = options.free or tuple(f"{Mobil.kind}.{p.name}" for p in Mobil.declared)
-    models: list[Choice] = [UtilityLogit(model.simulator(Lanes(2)), free), ConstantRate(), GapLogit()]
+    mobil = discrete_choice.UtilityLogit(model.simulator(Lanes(2)), free)
+    models: list[discrete_choice.Choice] = [mobil, discrete_choice.ConstantRate(), discrete_choice.GapLogit()]
     fitted = []
     for k, each in enumerate(models):
         progress("fitting", k, len(models), each.title)
-        fitted.append(fit_choice(each, decisions))
+        fitted.append(discrete_choice.fit_choice(each, decisions))
     progress("drivers held out", 0, 0, f"{FOLDS} folds")
-    fold = folds(decisions, FOLDS, options.seed)
+    fold = discrete_choice.folds(decisions, FOLDS, options.seed)
     if int(torch.unique(fold[decisions.vehicle[decisions.chosen > 0]]).numel()) < 2:
         raise DataError(f"{trajectories.source}: only one driver changes lanes. Nobody could be held out; take more.")
-    seen = held_out(fitted, decisions, fold)
+    seen = discrete_choice.held_out(fitted, decisions, fold)
     numbers = replaced(model.parameters, dict(zip(free, fitted[0].theta.tolist(), strict=False)))
     return LaneChanges(decisions, tuple(fitted), tuple(seen), replace(model, parameters=numbers, fitted_on={}))
 
