@@ -20,7 +20,7 @@ from idm_env.discovery.records import Records
 from idm_env.discovery.result import Result
 from idm_env.discovery.selection import Decided, Round
 from idm_env.discovery.solve import Problem, Solution
-from idm_env.discovery.verdict import Reason, Verdict, improves
+from idm_env.discovery.verdict import Reason, Refusal, Verdict, improves
 from idm_env.effects import Brakes
 from idm_env.jobs import storage
 from idm_env.model_file import Model as SavedModel
@@ -94,6 +94,10 @@ def finished(
             decided.null.model, before, partial(evaluation.against_null, reached=reached),
             partial(evaluation.nearest, reached=reached), evaluation.seed, on_law,
         )  # fmt: skip
+    least = judge.least_m(evaluation.records)
+    if judgement.is_exact(least):
+        judgement = replace(judgement, added=False, refusal=judgement.refusal or Refusal(Reason.SMALL_SIZE, least))
+    elif laws:
         evaluation, decided, judgement, last = _on_the_best(evaluation, decided, judgement, last, laws, searched)
         if evaluation.adapt and judgement.of_all is not None:
             judgement = judgement.split(fleet.found(laws, judgement.of_all, of_laws.among, evaluation.seed))
@@ -101,13 +105,14 @@ def finished(
     first, before = evaluation.of_null
     final = judgement.compared if judgement.added and judgement.compared is not None else null
     everywhere = judge.windowed(prepared, problem, final)
-    judgement = replace(judgement, shared=shared.find(places.respond(*everywhere), evaluation.seed))
+    if not judgement.is_exact(least):
+        judgement = replace(judgement, shared=shared.find(places.respond(*everywhere), evaluation.seed))
     scored = prepared if evaluation.test is None else evaluation.test
     floor = ceilings.floor(scored, ceilings.drift(trajectories))
     if evaluation.adapt and before is not None:
         pooled = evaluation.judged(null, pooled=True)[1]
         ladder = judgement.climbed(prepared, pooled, floor["horizon_rmse_m"])
-        if not (judgement.added or judgement.law or judgement.fleet):
+        if not (judgement.added or judgement.law or judgement.fleet or judgement.is_exact(least)):
             leading = decided.rounds[0].leading
             agreements = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
             ladder = replace(ladder, agreement=agreements[0], leading=None if leading is None else agreements[1])

@@ -15,6 +15,11 @@ from idm_env.discovery.records import Records, Rows, block_seconds, whole, windo
 from idm_env.discovery.solve import Population, Problem, Solution, cost_of, solve
 from idm_env.discovery.units import units
 
+LEAST_SIZE = 0.01
+"""Share of the error at constant speeds 5 s ahead below which a difference of predictions has no practical size.
+
+In generated sets half the usual strengths of the catalogue move them by 1.5 % and more, another integrator by 0.1 %.
+"""
 STUCK = 5.0
 """Times the median group's error (RMS) from which a fit is begun once more."""
 
@@ -199,7 +204,8 @@ def windowed(records: Records, problem: Problem, solution: Solution) -> tuple[Pr
     rows = windows(records)
     in_windows = Problem(rows, problem.noise.unweighted(len(rows)), replace(problem.prior, centre_follows=False))
     start = np.tile(problem.prior.centre, (in_windows.groups, 1))
-    return in_windows, solve(in_windows, solution.model.fixed(solution.values), start, np.zeros(0))
+    fitted = solve(in_windows, solution.model.fixed(solution.values), start, np.zeros(0))
+    return in_windows, replace(fitted, model=solution.model, values=solution.values)
 
 
 def halves(rows: Rows) -> np.ndarray:
@@ -239,6 +245,14 @@ def floor(records: Records) -> dict[str, float]:
         "horizon_rmse_m": gap,
         "speed_rmse_mps": float(np.sqrt(np.mean(np.square(speeds)))),
     }
+
+
+def least_m(records: Records) -> float:
+    """Return the least practical size of an error 5 s ahead (m): ``LEAST_SIZE`` of that at constant speeds (RMS)."""
+    rows = windows(records)
+    opening = records.column("lead_speed")[rows.start] - records.speed[rows.start]
+    change = records.gap[rows.samples[:, -1]] - records.gap[rows.start]
+    return LEAST_SIZE * float(np.sqrt(np.mean((change - rows.steps * records.dt * opening) ** 2)))
 
 
 def ceiling(responses: places.Responses, prior_spread: float = 0.15) -> np.ndarray:

@@ -81,6 +81,10 @@ class Judgement:
             return False
         return improves(self.errors)
 
+    def is_exact(self, least_m: float) -> bool:
+        """Tell whether the null's errors 5 s ahead are of no practical size, so that nothing can be missing."""
+        return self.before is not None and self.before.summary()["horizon_rmse_m"] < least_m
+
     def beside(self, best: bases.Law) -> Judgement:
         """Return the judgement beside the best law: where that is better than an addition, nothing is added.
 

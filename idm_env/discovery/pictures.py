@@ -45,23 +45,6 @@ def ranking(this: Round) -> Figure:
     return figure
 
 
-def absorption(d: Discovery) -> Figure | None:
-    """Bars of the absorbed share."""
-    shares = [
-        (c.absorbed_share, words.plain(c.effect)) for c in d.result.candidates
-        if c.round == 1 and c.named and c.absorbed_share is not None
-    ]  # fmt: skip
-    if not shares:
-        return None
-    shares.sort(key=lambda x: x[0])
-    figure, axes = plt.subplots(layout="constrained", figsize=(7.2, 0.22 * len(shares) + 0.9))
-    axes.barh(range(len(shares)), [100 * share for share, _ in shares], color=GREY)
-    axes.set_yticks(range(len(shares)), [name for _, name in shares])
-    axes.set_xlim(0, 100)
-    axes.set_xlabel("absorbed by re-calibration (%)")
-    return figure
-
-
 def _projected(d: Discovery, scored: Any) -> np.ndarray | None:
     solution = scored.solution
     if solution is None or not solution.linear.by_phi.shape[-1]:

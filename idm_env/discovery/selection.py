@@ -90,7 +90,9 @@ class Round:
 
     @property
     def leading(self) -> Term | None:
-        """The candidate that gained most of those that gained enough, beyond chance."""
+        """The candidate that gained most of those that gained enough, beyond chance; None where that is of no size."""
+        if self.refusal is not None and self.refusal.reason is Reason.SMALL_SIZE:
+            return None
         least = together.LEAST_GAIN if self.in_closed_loop else LEAST_GAIN
         able = np.flatnonzero((self.tested.p_value < ALPHA) & (self.tested.gain >= least))
         return self.scored[able[self.tested.gain[able].argmax()]].term if len(able) else None
@@ -143,7 +145,7 @@ def _joined(
     joined, forward = together.grow(searching, searching.weighed(now)[0], len(null.model.terms), seed)
     rounds += [
         Round(s.scored, s.tested, last.before, last.left, s.winner, equivalent=s.equivalent, in_closed_loop=True,
-              run=units(searching.problem.rows.records, MANY_RUNS).run)
+              run=units(searching.problem.rows.records, MANY_RUNS).run, refusal=s.refusal)
         for s in forward if s.scored
     ]  # fmt: skip
     return joined
@@ -263,6 +265,20 @@ def _same_class(term: Term, model: Hypothesis) -> bool:
     return _late(term.effect) and any(_late(t.effect) and t.effect != term.effect for t in model.terms)
 
 
+def _is_small(searching: Search, now: Solution, chosen: Solution) -> bool:
+    """Tell whether an addition has no practical size.
+
+    A latency is below half a step, or predictions 5 s ahead move by less than ``judge.least_m`` (RMS). A latency that
+    comes first is not refused: below a step it becomes part of the null.
+    """
+    problem, added = searching.problem, chosen.model.terms[len(now.model.terms) :]
+    first = len(added) == 1 and now.model.terms == searching.base.terms
+    if not first and together.is_too_short(chosen, added, problem.rows.records.dt):
+        return True
+    before, after = (problem.errors(s.theta[None], s.model, s.values[None])[0][:, -1] for s in (now, chosen))
+    return bool(np.sqrt(np.mean((after - before) ** 2)) < judge.least_m(problem.rows.records))
+
+
 def _late(name: str | None) -> bool:
     """Tell whether an effect is a latency."""
     return name is not None and ALL[name].latency
@@ -295,11 +311,14 @@ def _choose(searching: Search, now: Solution, this: Round) -> None:
     winner = max(named, key=lambda i: tested.gain[i]) if named else best
     chosen = scored[winner].solution
     assert chosen is not None
+    this.partial = winner
+    if _is_small(searching, now, chosen):
+        this.refusal = Refusal(Reason.SMALL_SIZE, judge.least_m(searching.problem.rows.records))
+        return
     after = judge.ceiling(places.respond(searching.problem, chosen))
     gained, rest = float(tested.gain[winner]), max(float(after.mean()), 0.0)
     explained = 1.0 - np.exp(-2 * gained)
     this.share = float(explained / max(explained + np.exp(-2 * gained) * (1.0 - np.exp(-2 * rest)), 1e-12))
-    this.partial = winner
     if this.share < LEAST_SHARE:
         this.refusal = Refusal(Reason.SMALL_SHARE, figure=this.share)
         return

@@ -52,10 +52,10 @@ def summarise(
     run = units(problem.rows.records).run
     strengths = _strengths(first, problem, bar(first, run, judged.seed, len(test_runs)))
     others = [name for f in added if f.effect for name in f.equivalent if name in ALL]
-    verdict, refusal = _verdict(judged, rounds, added, others, strengths, problem)
+    verdict, refusal = _verdict(judged, rounds, added, others, strengths, evaluation)
     data = _data(trajectories, evaluation, rounds, judged.null, by)
     sentence = words.headline(
-        verdict, [f.clause for f in added], refusal, judged.tried, errors, judged.shared, others, strengths, law
+        verdict, [f.clause for f in added], refusal, judged.tried, errors, judged.shared, others, law
     )
     after = judged.after if judged.added else before
     sentence = " ".join(
@@ -141,10 +141,10 @@ def _of_laws(judged: Judgement, laws: Sequence[bases.Law], drivers: Solution | N
 
 def _verdict(
     judged: Judgement, rounds: Sequence[Round], added: Sequence[result.TermFinding], others: Sequence[str],
-    strengths: dict[str, Strength], problem: Problem,
+    strengths: dict[str, Strength], evaluation: Evaluation,
 ) -> tuple[Verdict, Refusal | None]:  # fmt: skip
     """Return what is concluded, and why nothing (more) was added."""
-    first, refusal, ladder = rounds[0], judged.refusal, judged.ladder
+    first, refusal, ladder, problem = rounds[0], judged.refusal, judged.ladder, evaluation.searching.problem
     counted = units(problem.rows.records)
     power = len(problem.rows.records.runs) >= MANY_RUNS or powerful(
         [s for s in strengths.values() if s.knots == 1], first.tested, smallest_p(counted.run)
@@ -156,10 +156,12 @@ def _verdict(
         bool(added), any(f.effect for f in added), refusal, structured or unnamed > 0.0, first.left, power,
         judged.shared is not None, apart=not others,
         in_a_state=all(f.where.coordinate in (*STATES, "state") for f in added),
+        exact=judged.is_exact(least := judge.least_m(evaluation.records)),
     )  # fmt: skip
     if verdict is Verdict.NONE and refusal is not None:
-        return verdict, Refusal(Reason.NO_GAIN)
-    if refusal is not None and refusal.reason is not Reason.NO_GAIN:
+        small = judged.is_exact(least) or refusal.reason is Reason.SMALL_SIZE
+        return verdict, Refusal(Reason.SMALL_SIZE, least) if small else Refusal(Reason.NO_GAIN)
+    if refusal is not None and refusal.reason not in (Reason.NO_GAIN, Reason.SMALL_SIZE):
         return verdict, refusal
     if verdict is Verdict.UNEXPLAINED and unnamed and refusal is not None:
         refusal = Refusal(Reason.STRUCTURE, unnamed)

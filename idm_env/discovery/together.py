@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from idm_env.discovery import closed_loop
+from idm_env.discovery import closed_loop, judge
 from idm_env.discovery import model as terms
 from idm_env.discovery.closed_loop import ClosedLoopFit, Line
+from idm_env.discovery.model import Term
 from idm_env.discovery.score import ALPHA, CLOSED_LOOP_SHARE, Tested, at_level, interval_of, westfall_young
 from idm_env.discovery.search import Scored, Search
 from idm_env.discovery.solve import Solution
+from idm_env.discovery.verdict import Reason, Refusal
 from idm_env.effects import ALL
 
 LEAST_GAIN = 0.01
@@ -30,6 +33,7 @@ class Step:
     tested: Tested
     winner: int | None
     equivalent: list[int]
+    refusal: Refusal | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +70,14 @@ def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple
         steps.append(step)
         if grown is None:
             break
-        solution = grown
-        fit = closed_loop.evaluate(fit.problem.rows.records, grown.model, grown.values, fit.problem.prior, grown.theta)
+        records = fit.problem.rows.records
+        after = closed_loop.evaluate(records, grown.model, grown.values, fit.problem.prior, grown.theta)
+        moved, least = after.linear.residual - fit.linear.residual, judge.least_m(records)
+        late = is_too_short(grown, grown.model.terms[-1:], records.dt)
+        if late or float(np.sqrt(np.mean(moved[after.problem.rows.valid] ** 2))) < least:
+            step.winner, step.refusal = None, Refusal(Reason.SMALL_SIZE, least)
+            break
+        solution, fit = grown, after
     if solution is None:
         return None, steps
     solution = _backward(start, solution, base)
@@ -121,6 +131,12 @@ def _without(start: ClosedLoopFit, solution: Solution, index: int) -> Solution:
     gone = np.arange(begin, begin + solution.model.terms[index].size)
     fit = replace(start, theta=solution.theta)
     return closed_loop.joint(fit, solution.model.without(index), np.delete(solution.values, gone))
+
+
+def is_too_short(solution: Solution, added: Sequence[Term], dt: float) -> bool:
+    """Tell whether any of the terms ``added`` is a latency below half a step (s)."""
+    late = [t for t in added if t.effect is not None and ALL[t.effect].latency]
+    return any(abs(float(solution.values[solution.model.where(t.label)][0])) < 0.5 * dt for t in late)
 
 
 def contains_null(solution: Solution, intervals: np.ndarray, index: int) -> bool:

@@ -36,6 +36,7 @@ class Reason(str, Enum):
     NO_POWER = "no_power"
     NO_GAIN = "no_gain"
     SMALL_SHARE = "small_share"
+    SMALL_SIZE = "small_size"
     CLOSED_LOOP = "free_simulation"
     TEST_SET = "lockbox"
     HELD_OUT = "held_out"
@@ -45,7 +46,7 @@ class Reason(str, Enum):
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why, and the figure that decided: runs left to choose on, or the share that the best candidate explains."""
+    """Why, and the figure that decided: runs left to choose on, the best candidate's share, the least size (m)."""
 
     reason: Reason
     figure: float = float("nan")
@@ -83,7 +84,7 @@ def mean_ratio(errors: Mapping[str, Comparison]) -> float:
 
 def conclude(
     added: bool, named: bool, refusal: Refusal | None, structured: bool, left: np.ndarray, power: bool = True,
-    shared: bool = False, apart: bool = True, in_a_state: bool = False,
+    shared: bool = False, apart: bool = True, in_a_state: bool = False, exact: bool = False,
 ) -> Verdict:  # fmt: skip
     """Return the verdict.
 
@@ -97,7 +98,10 @@ def conclude(
         shared: Whether vehicles of one run miss the model alike at one time.
         apart: Whether no other effect of the catalogue did about as well as one that was added.
         in_a_state: Whether all that was added acts in a state of the driver, and nothing at a place or a time.
+        exact: Whether the model's errors are too small for anything to be missing.
     """
+    if exact:
+        return Verdict.NONE
     if added:
         if named:
             return Verdict.NAMED if apart else Verdict.ONE_OF

@@ -46,8 +46,6 @@ ALONG = {
     "position": "place", "time": "time", "speed": "speed", "gap": "gap", "closing_speed": "closing speed",
     "lead_accel": "leader's acceleration", "relative_gap": "gap relative to the desired one",
 }  # fmt: skip
-SHOWN = 3
-"""Effects named in the sentence of ``none``, of those known best and of those that show least."""
 MANY = 4
 """A term with more parameters than this is a curve: its range is told instead."""
 
@@ -154,6 +152,8 @@ def reason(refusal: Refusal | None, tried: str = "", law: str = "IDM") -> str:
         Reason.NO_POWER: f"the {figure:.0f} runs left for model selection would not have shown most effects at their "
         "usual strengths",
         Reason.NO_GAIN: "no candidate gains enough on held-out runs",
+        Reason.SMALL_SIZE: f"{tried or 'what candidates gain'} moves predictions 5 s ahead by less than "
+        f"{number(figure, 2)} m (1 % of the error at constant speeds), or is late by less than half a step",
         Reason.SMALL_SHARE: f"{tried} explains only {figure:.0%} of what can be explained",
         Reason.CLOSED_LOOP: f"{tried} makes free simulation worse",
         Reason.TEST_SET: f"the test set does not confirm {tried}",
@@ -168,8 +168,7 @@ def reason(refusal: Refusal | None, tried: str = "", law: str = "IDM") -> str:
 
 def headline(
     verdict: Verdict, clauses: Sequence[str], refusal: Refusal | None, tried: str, errors: Mapping[str, Comparison],
-    shared: Shared | None = None, others: Sequence[str] = (), strengths: Mapping[str, Strength] | None = None,
-    law: str = "IDM",
+    shared: Shared | None = None, others: Sequence[str] = (), law: str = "IDM",
 ) -> str:  # fmt: skip
     """Say in one sentence what is missing, or why nothing can be said.
 
@@ -181,7 +180,6 @@ def headline(
         errors: How errors on the test set changed with what was added or came nearest.
         shared: What vehicles of one run do alike, told where nothing was added.
         others: Effects that these data do not tell from what was added.
-        strengths: What the data say of the strengths of absent effects, by name.
         law: Title of the law that was to be completed.
     """
     if refusal is not None and refusal.reason is Reason.LAW:
@@ -196,11 +194,10 @@ def headline(
         if verdict is Verdict.ONE_OF:
             unnamed = f"; or {' or '.join(plain(x) for x in others)}, which these data do not tell from it"
         return f"{text[0].upper()}{text[1:]}{unnamed}{_but(errors)}."
+    if verdict is Verdict.NONE and refusal is not None and refusal.reason is Reason.SMALL_SIZE:
+        return f"Nothing of practical size is missing: {reason(refusal, tried)}."
     if verdict is Verdict.NONE:
-        return (
-            "Nothing is missing that these data could show: no candidate lowers the held-out error"
-            f"{_limits(strengths or {})}."
-        )
+        return "Nothing is missing that these data could show: no candidate lowers the held-out error."
     if verdict is Verdict.CANNOT_TELL:
         powerless = refusal is not None and refusal.reason is Reason.NO_POWER
         needed = "more runs, ten or more," if powerless else "four runs of three followers or seven runs, better ten,"
@@ -283,30 +280,9 @@ def details(verdict: Verdict, found: Sequence[TermFinding], nearest: Sequence[Te
     return parts
 
 
-def _limits(strengths: Mapping[str, Strength]) -> str:
-    """Say of the effects that these data know best what is excluded, and what the least visible ones would hide."""
-    if not strengths:
-        return ""
-    agreed = [name for name, s in strengths.items() if s.is_agreed]
-    best = sorted(agreed, key=lambda name: strengths[name].beyond / strengths[name].typical)[:SHOWN]
-    worst = sorted(strengths, key=lambda name: -strengths[name].seen / strengths[name].typical)[:SHOWN]
-    bounds = ", ".join(f"no {plain(n)} beyond {_strength(strengths[n], strengths[n].beyond)}" for n in best)
-    hidden = ", ".join(f"a {plain(n)} {_below(_strength(strengths[n], strengths[n].seen))}" for n in worst)
-    bounds = f"there is {bounds} (95 %), and " if bounds else ""
-    return f"; {bounds}{hidden} would not have been seen"
-
-
 def _below(strength: str) -> str:
     """Say up to which strength nothing would be seen."""
     return f"below {strength}" if strength else "of whatever strength"
-
-
-def _strength(s: Strength, distance: float) -> str:
-    """Return a distance from the null, shares in percent; nothing where it is infinite."""
-    if not math.isfinite(distance):
-        return ""
-    unit = s.parameter.unit
-    return f"{number(100.0 * distance, 2)} %" if unit == "1" else f"{number(distance, 2)} {unit}"
 
 
 def excluded(verdict: Verdict, strengths: Mapping[str, Strength]) -> list[str]:

@@ -56,12 +56,13 @@ def test_the_loop_of_a_law_is_the_simulator(platoon: Records, name: str) -> None
         (1.06, 1.06, False, True),
         (2.0, 0.8, False, False),
         (0.8, 2.0, False, False),
-        (0.8, 0.96, True, True),
-        (0.8, 0.94, True, False),
+        (0.9, 0.96, True, True),
+        (0.9, 0.94, True, False),
+        (0.8, 0.97, True, False),  # 19 % less in closed loop was held to be worse
     ],
 )
 def test_laws_that_cannot_be_better_need_no_cross_fitting(gap: float, ahead: float, has_null: bool, far: bool) -> None:
-    """One that has the null in it must at least predict the very data better 5 s ahead."""
+    """One that has the null in it must at least err less on the very data, 5 s ahead or in closed loop."""
     law, null = (
         cast(Judged, SimpleNamespace(summary=partial(dict, gap_rmse_m=x, horizon_rmse_m=y)))
         for x, y in ((gap, ahead), (1.0, 1.0))

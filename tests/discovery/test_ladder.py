@@ -114,7 +114,7 @@ def test_nothing_is_not_said_of_an_effect_without_a_name(monkeypatch: pytest.Mon
     monkeypatch.setattr(hidden, "_desired_gap", doubled)
     made, _ = synthetic.generate(83)
     monkeypatch.undo()
-    monkeypatch.setattr(bases, "OWN", 1.0)
+    monkeypatch.setattr(bases, "OWN", dict.fromkeys(bases.OWN, 1.0))
     found = discover(made, effects=["drag"])
     told = found.report["ladder"]
     assert found.verdict is Verdict.UNEXPLAINED, found.report["sentence"]
