@@ -186,10 +186,7 @@ class ConstantTimeGap(OfFiveParameters):
     """
 
     kind: ClassVar[str] = "constant_time_gap"
-    sources: ClassVar[tuple[str, ...]] = (
-        references.MILANES_2014,
-        references.XIAO_2017,
-    )
+    sources: ClassVar[tuple[str, ...]] = (references.MILANES_2014, references.XIAO_2017)
     adds: ClassVar[bool] = False
     title: ClassVar[str] = "linear constant time gap"
     equation: ClassVar[str] = "min(k_s (s − s0 − v T) + k_v (v_lead − v) + c a_lead, k_0 (v0 − v)), limited and lagged"

@@ -212,8 +212,7 @@ class GapAcceptance(Effect):
             other = torch.minimum(other + most, side.with_me + hardest(side.follower.speed))
             follower = torch.where(side.follower.present > 0, other, most)
             own = torch.minimum(
-                own - torch.minimum(here.wanted, -most),
-                side.wanted - torch.minimum(here.wanted, -hardest(scene.speed)),
+                own - torch.minimum(here.wanted, -most), side.wanted - torch.minimum(here.wanted, -hardest(scene.speed))
             )
             safe = torch.minimum(torch.minimum(follower, own), room(side))
             return torch.where(desire > 0, safe, -COMMANDED)
@@ -259,8 +258,5 @@ class LaneCommand(Effect):
             return torch.where(active, torch.where(direction > 0, COMMANDED, -COMMANDED), 0.0) + 0.0 * scene.speed
 
         return Wish(
-            utility(side),
-            utility(-side),
-            margin(left, here, p["safe_decel"]),
-            margin(right, here, p["safe_decel"]),
+            utility(side), utility(-side), margin(left, here, p["safe_decel"]), margin(right, here, p["safe_decel"])
         )

@@ -21,10 +21,7 @@ class Asymmetry(Effect):
     """Weaker acceleration than braking: ``a > 0: (1 − k) a``, ``a < 0: (1 + k) a`` (Newell; Laval and Leclercq)."""
 
     kind: ClassVar[str] = "asymmetry"
-    sources: ClassVar[tuple[str, ...]] = (
-        references.NEWELL_1965,
-        references.LAVAL_2010,
-    )
+    sources: ClassVar[tuple[str, ...]] = (references.NEWELL_1965, references.LAVAL_2010)
     title: ClassVar[str] = "asymmetry"
     equation: ClassVar[str] = "a > 0: (1 − k) a, a < 0: (1 + k) a"
     wording: ClassVar[tuple[str, str]] = (

@@ -27,10 +27,7 @@ class Delay(Effect):
     rank: ClassVar[int] = -10
     title: ClassVar[str] = "reaction delay"
     equation: ClassVar[str] = "all that is seen is taken at t − τ"
-    wording: ClassVar[tuple[str, str]] = (
-        "",
-        "drivers react later than {law}",
-    )
+    wording: ClassVar[tuple[str, str]] = ("", "drivers react later than {law}")
     looks_like: ClassVar[tuple[str, ...]] = ("lag", "leader_acceleration with the other sign")
     told_by: ClassVar[str] = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells delay from lag"
     cancels: ClassVar[tuple[str, ...]] = ("leader_acceleration", "second_leader")
@@ -66,10 +63,7 @@ class DeadZone(Effect):
     sources: ClassVar[tuple[str, ...]] = (references.WIEDEMANN_1974,)
     title: ClassVar[str] = "threshold of looming"
     equation: ClassVar[str] = "Δv is seen as 0 while 1.8 |Δv| / s² < θ"
-    wording: ClassVar[tuple[str, str]] = (
-        "",
-        "drivers do not notice the small closing speeds that {law} reacts to",
-    )
+    wording: ClassVar[tuple[str, str]] = ("", "drivers do not notice the small closing speeds that {law} reacts to")
     looks_like: ClassVar[tuple[str, ...]] = ("comfort_decel", "action_point")
     told_by: ClassVar[str] = "slow approaches at long gaps tell a threshold from softer braking"
     acts_on: ClassVar[str] = "closing_speed"

@@ -56,10 +56,7 @@ class SetPointAsymmetry(Effect):
     """
 
     kind: ClassVar[str] = "set_point_asymmetry"
-    sources: ClassVar[tuple[str, ...]] = (
-        references.NEWELL_1965,
-        references.YEO_2009,
-    )
+    sources: ClassVar[tuple[str, ...]] = (references.NEWELL_1965, references.YEO_2009)
     rank: ClassVar[int] = 2
     title: ClassVar[str] = "asymmetric time gap"
     equation: ClassVar[str] = "T → T (1 + k a_lead / √(a_lead² + 0.09 m²/s⁴))"

@@ -185,10 +185,7 @@ class Problem:
     def _weigh(self, gap: Tensor, speed: Tensor) -> Tensor:
         """Stack weighted differences (or derivatives) of gap and speed: linear in both."""
         shape = (-1, *(1,) * (gap.dim() - 2), gap.shape[-1])
-        pair = {
-            "spacing": gap * self.weights[0].reshape(shape),
-            "speed": speed * self.weights[1].reshape(shape),
-        }
+        pair = {"spacing": gap * self.weights[0].reshape(shape), "speed": speed * self.weights[1].reshape(shape)}
         return torch.cat([x for name, x in pair.items() if self.objective in (name, "both")])
 
     @cached_property
