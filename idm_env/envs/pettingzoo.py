@@ -8,6 +8,7 @@ Shapes: an agent observes ``[features]``; the state of the traffic is one row, `
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -24,8 +25,7 @@ from idm_env.envs.batch import Batch, Outcome
 from idm_env.envs.gym import Pictures
 from idm_env.envs.info import ids
 from idm_env.envs.settings import RENDER_MODES, settings
-from idm_env.envs.spaces import action_space, continuous, numpy_dtype, observation_box
-from idm_env.validation import shown
+from idm_env.envs.spaces import action_of, action_space, numpy_dtype, observation_box
 
 _SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0
 
@@ -64,8 +64,13 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         self.possible_agents = [f"vehicle_{i}{trip}" for i in self.task.agents for trip in trips]
         self.agents: list[str] = []
         self._slots: list[str] = []
-        self.observation_spaces = {a: observation_box(self.task, own.dtype, 1) for a in self.possible_agents}
-        self.action_spaces = {a: action_space(self.task, 1) for a in self.possible_agents}
+        seen, done = (partial(observation_box, self.task, own.dtype, 1), partial(action_space, self.task, 1))
+        # Agents that begin later share one space: whoever seeds those of the first ones has seeded theirs.
+        later = bool(self.task.journeys)
+        self.observation_spaces, self.action_spaces = (
+            dict.fromkeys(self.possible_agents, make()) if later else {a: make() for a in self.possible_agents}
+            for make in (seen, done)
+        )
         kind, n = numpy_dtype(own.dtype), self.task.vehicles
         low = np.repeat(np.array([0.0, -1.0], kind), n)
         high = np.repeat(np.array([10.0, _FARTHEST / _GAP_SCALE], kind), n)
@@ -101,23 +106,25 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         return self._by_agent(seen), {agent: self._begun(i) for i, agent in enumerate(self._slots) if agent}
 
     def step(
-        self, actions: dict[str, np.ndarray]
+        self, actions: dict[str, Any] | None
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """Advance by the time for which an action is held, with one action for every agent that is still there."""
+        """Advance by the time for which an action is held, with one action for every agent that is still there.
+
+        None as an action leaves an agent's vehicle to its driver; None in place of all of them leaves all.
+        """
         if not self.agents:
             return {}, {}, {}, {}, {}
         before = self._slots
         live = [agent in self.agents for agent in before]
-        commands = np.zeros((1, len(self.task.commands), len(live)))
-        for i, agent in enumerate(before):
-            if live[i]:
-                commands[0, :, i] = self._action(agent, actions)
-        own = self.settings
+        chosen = [self._action(a, actions) if here else None for a, here in zip(before, live, strict=True)]
+        act = [x is not None for x in chosen]
+        commands = np.zeros((1, len(self.task.commands), len(live)), numpy_dtype(self.settings.dtype))
+        for i in np.flatnonzero(act):
+            commands[0, :, i] = chosen[i]
         with torch.no_grad():
-            everybody = all(live)
             outcome = self.batch.step(
-                torch.as_tensor(commands.reshape(1, -1), dtype=own.dtype, device=own.device),
-                None if everybody else torch.tensor([live], device=own.device),
+                torch.from_numpy(commands.reshape(1, -1)).to(self.settings.device) if any(act) else None,
+                None if all(act) or not any(act) else torch.tensor([act], device=self.settings.device),
             )
         observations = self._by_agent(np.asarray(outcome.observation[0]))
         rewards, terminated, truncated = (self._by_agent(x[0].tolist()) for x in outcome[1:4])
@@ -174,19 +181,16 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
             info["crash_reason"] = self.batch.crash_reason(0, i if self.task.shares > 1 else None)
         return info | self._begun(i)
 
-    def _action(self, agent: str, actions: dict[str, np.ndarray]) -> np.ndarray:
+    def _action(self, agent: str, actions: dict[str, Any] | None) -> Any:
+        """Return the commands of an agent, None where its vehicle is left to its driver."""
+        if actions is None or (agent in actions and actions[agent] is None):
+            return None
         if agent not in actions:
             raise ValueError(f"there is no action for agent '{agent}'. Give one for each of env.agents.")
-        action = np.asarray(actions[agent])
-        size, levels = len(self.task.commands), self.task.levels
-        if levels is not None:
-            return continuous(action, levels, (size,))
-        if action.shape != (size,) or action.dtype.kind not in "fiu" or not np.isfinite(action).all():
-            several = "one finite number" if size == 1 else f"{size} finite numbers"
-            raise ValueError(
-                f"action of '{agent}' = {shown(actions[agent])} must be {several}, as an array of shape ({size},)."
-            )
-        return action
+        try:
+            return action_of(actions[agent], (len(self.task.commands),), self.settings)
+        except ValueError as error:
+            raise ValueError(f"agent '{agent}': {error}") from None
 
     def _by_agent(self, values: Any) -> dict[str, Any]:
         return {agent: values[i] for i, agent in enumerate(self._slots) if agent in self.agents}

@@ -52,35 +52,29 @@ def continuous(action: Any, levels: Sequence[int], shape: tuple[int, ...]) -> np
 def action_of(action: Any, shape: tuple[int, ...], made: Settings) -> Tensor | np.ndarray:
     """Return an action as what ``Batch.step`` takes: an array with numpy output, else a tensor with its graph.
 
-    ValueError for a wrong shape, or values that are not finite; float32 and float64, numpy and torch are all accepted.
+    Every type of number and every order in memory is accepted. ValueError for a wrong shape, or values that are not
+    finite.
     """
     levels = made.task.levels
     if levels is not None:
-        action = continuous(action, np.repeat(levels, len(made.task.agents)).tolist(), shape)
-    if (
-        made.output == "numpy"
-        and isinstance(action, np.ndarray)
-        and action.dtype.kind in "fiu"
-        and action.shape == shape
-    ):
-        array = action.astype(numpy_dtype(made.dtype))
-        if math.isfinite(array.item() if array.size == 1 else array.sum()) or np.isfinite(array).all():
-            return array
-    if isinstance(action, Tensor):
-        if action.dtype == torch.bool or action.is_complex():
-            raise ValueError(f"an action of type {action.dtype} is not a number. Give floats in [-1, 1].")
-        tensor = action
-    else:
-        array = np.asarray(action)
-        if array.dtype.kind not in "fiu":
-            raise ValueError(f"an action of type {array.dtype} is not a number. Give floats in [-1, 1].")
-        tensor = torch.from_numpy(array) if array.flags.writeable and array.flags.c_contiguous else torch.tensor(array)
-    if tensor.shape != shape:
+        action = continuous(action, np.repeat(levels, shape[-1] // len(levels)).tolist(), shape)
+    x: Any = action if isinstance(action, Tensor) else np.asarray(action)
+    whole = x.dtype.kind in "fiu" if isinstance(x, np.ndarray) else not (x.dtype == torch.bool or x.is_complex())
+    if not whole:
+        raise ValueError(f"an action of type {x.dtype} is not a number. Give floats in [-1, 1].")
+    if x.shape != shape:
         raise ValueError(
-            f"action has shape {tuple(tensor.shape)}, and {shape} is needed: one number per controlled vehicle."
+            f"action has shape {tuple(x.shape)}, and {shape} is needed: one number per controlled vehicle."
         )
-    tensor = tensor.to(device=made.device, dtype=made.dtype)
-    # The sum is finite only if every part is, and is one number; only a doubtful sum is looked at more closely.
-    if not np.isfinite(tensor.detach().sum().item()) and not bool(torch.isfinite(tensor.detach()).all()):
+    held = x.detach() if isinstance(x, Tensor) else x
+    finite = torch.isfinite if isinstance(x, Tensor) else np.isfinite
+    if not (math.isfinite(held.item()) if math.prod(shape) == 1 else finite(held).all()):
         raise ValueError("action holds NaN or infinite values. Give finite numbers; those outside [-1, 1] are clipped.")
-    return tensor.detach().cpu().numpy() if made.output == "numpy" else tensor
+    kind = numpy_dtype(made.dtype)
+    if x.dtype.itemsize > np.dtype(kind).itemsize:  # what is finite stays so
+        x = x.clip(-1.0, 1.0)
+    if isinstance(x, np.ndarray):
+        x = x.astype(kind, order="C")
+        return x if made.output == "numpy" else torch.from_numpy(x).to(made.device)
+    x = x.to(device=made.device, dtype=made.dtype)
+    return x.detach().cpu().numpy() if made.output == "numpy" else x  # type: ignore[no-any-return]

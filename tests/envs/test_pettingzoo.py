@@ -65,6 +65,13 @@ def test_seeds():
     seed_test(lambda: env(**QUICK), num_cycles=20)
 
 
+def test_whoever_seeds_the_first_agents_has_seeded_those_that_begin_later():
+    """The official test seeds the spaces of the agents that are there after ``reset``, and samples those of all."""
+    seed_test(lambda: env(task="merge"), num_cycles=30)
+    made = parallel_env(task="merge", controlled=0.3)
+    assert len({id(made.action_space(a)) for a in made.possible_agents}) == 1 < len(made.possible_agents)
+
+
 def test_state():
     state_test(env(**QUICK), parallel_env(**QUICK), num_cycles=5)
 
