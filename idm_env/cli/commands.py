@@ -13,23 +13,8 @@ from typing import Annotated, Any, NoReturn
 
 import idm_env
 from idm_env import validation
-from idm_env.cli import answers, end_at_once, refusals
+from idm_env.cli import answers, end_at_once, options, refusals
 from idm_env.cli.answers import console
-from idm_env.cli.options import (
-    OUT,
-    POSITIONAL,
-    FileOptions,
-    JobOptions,
-    Limits,
-    MaxGap,
-    MinSeconds,
-    RingLength,
-    Seed,
-    SourceOptions,
-    Step,
-    TrackOptions,
-    spread,
-)
 from idm_env.extras import needed
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, shown
@@ -96,8 +81,8 @@ def _stop(number: int, frame: object) -> NoReturn:
 def demo(
     data: Path | None = None,
     columns: str | None = None,
-    out: Path = OUT,
-    seed: Annotated[int, Limits(0, 1e9)] = 7,
+    out: Path = options.OUT,
+    seed: Annotated[int, options.Limits(0, 1e9)] = 7,
 ) -> None:
     """Generate platoons with a hidden effect, and find it: the whole of `explain` in half a minute.
 
@@ -131,15 +116,15 @@ def demo(
 @app.command()
 def plot(
     source: Path,
-    out: Path = OUT / "space-time.png",
+    out: Path = options.OUT / "space-time.png",
     html: bool = False,
-    panels: Annotated[int, Limits(1, 1000)] = 6,
-    ring_length: RingLength = None,
+    panels: Annotated[int, options.Limits(1, 1000)] = 6,
+    ring_length: options.RingLength = None,
     layout: str = "auto",
     columns: str | None = None,
     where: list[str] | None = None,
-    seconds: Annotated[float, Limits(0.1, 1e5, "s")] = 300.0,
-    seed: Seed = 0,
+    seconds: Annotated[float, options.Limits(0.1, 1e5, "s")] = 300.0,
+    seed: options.Seed = 0,
     trust: bool = False,
 ) -> None:
     """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout.
@@ -223,8 +208,8 @@ def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress)
 def filter_(
     *,
     data: Path,
-    job: JobOptions,
-    tracks: TrackOptions,
+    job: options.JobOptions,
+    tracks: options.TrackOptions,
     trust: bool = False,
 ) -> None:
     """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters.
@@ -246,9 +231,9 @@ def filter_(
 def reconstruct(
     *,
     data: Path,
-    job: JobOptions,
-    dt: Annotated[float, Limits(0.01, 2.0, "s")] = 0.1,
-    tracks: TrackOptions,
+    job: options.JobOptions,
+    dt: Annotated[float, options.Limits(0.01, 2.0, "s")] = 0.1,
+    tracks: options.TrackOptions,
     trust: bool = False,
 ) -> None:
     """Reconstruct dense trajectories from sparse ones, a second or more between points.
@@ -272,7 +257,7 @@ def fit(
     context: typer.Context,
     *,
     data: Path,
-    job: JobOptions,
+    job: options.JobOptions,
     by: str = "driver",
     held_out: str | None = None,
     objective: str = "spacing",
@@ -280,16 +265,16 @@ def fit(
     loss: str = "rmse",
     method: str = "lm",
     integration: str = "ballistic",
-    starts: Annotated[int, Limits(1, 1000)] = 4,
-    substeps: Annotated[int | None, Limits(1, 1000)] = None,
+    starts: Annotated[int, options.Limits(1, 1000)] = 4,
+    substeps: Annotated[int | None, options.Limits(1, 1000)] = None,
     model: str | None = None,
     base: str | None = None,
-    seed: Seed = 0,
-    file: SourceOptions,
+    seed: options.Seed = 0,
+    file: options.SourceOptions,
     sumo: Path | None = None,
     lane_changes: bool = False,
-    every: Annotated[float, Limits(0.1, 60.0, "s")] = 1.0,
-    ahead: Annotated[float, Limits(0.0, 10.0)] = 0.0,
+    every: Annotated[float, options.Limits(0.1, 60.0, "s")] = 1.0,
+    ahead: Annotated[float, options.Limits(0.0, 10.0)] = 0.0,
     first_lane: str = "left",
     trust: bool = False,
 ) -> None:
@@ -366,7 +351,7 @@ def _only(context: typer.Context, mode: str, accepted: set[str]) -> None:
 
 
 def _fit_lane_changes(
-    data: Path, out: Path, model: str | None, base: str | None, seed: int, file: FileOptions,
+    data: Path, out: Path, model: str | None, base: str | None, seed: int, file: options.FileOptions,
     every: float, ahead: float, first_lane: str,
 ) -> None:  # fmt: skip
     with shown(console) as report:
@@ -393,13 +378,13 @@ def _fit_lane_changes(
 def explain(
     *,
     data: list[Path],
-    job: JobOptions,
+    job: options.JobOptions,
     by: str = "driver",
     effects: str | None = None,
     known: str | None = None,
     base: str | None = None,
-    seed: Seed = 0,
-    file: FileOptions,
+    seed: options.Seed = 0,
+    file: options.FileOptions,
     split_runs: str | None = None,
 ) -> None:
     """Find the effect that a calibrated car-following model lacks, add it, and report the errors before and after.
@@ -470,9 +455,9 @@ def simulate(
     data: Path,
     model: Path | None = None,
     base: str | None = None,
-    out: Path = OUT,
-    seed: Seed = 0,
-    file: SourceOptions,
+    out: Path = options.OUT,
+    seed: options.Seed = 0,
+    file: options.SourceOptions,
     trust: bool = False,
 ) -> None:
     """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html.
@@ -491,6 +476,7 @@ def simulate(
         result = simulate_file(source, model, out, base=base, seed=seed, on_progress=report)
     answers.show("Errors in free simulation", in_words([result["error"]]))
     console.print(f"Gap RMSE {result['error']['gap_rmse_m']:.2f} m, {result['fitted_on']['words']}", soft_wrap=True)
+    console.print(result["drivers"], soft_wrap=True, highlight=False)
     answers.finished(out, result["data"]["account"])
 
 
@@ -498,12 +484,12 @@ def simulate(
 def drift(
     *,
     data: Path,
-    job: JobOptions,
-    drivers: Annotated[int, Limits(2, 10000)] = 60,
-    file: FileOptions,
-    max_gap: MaxGap = 80.0,
-    min_seconds: MinSeconds = 20.0,
-    dt: Step = None,
+    job: options.JobOptions,
+    drivers: Annotated[int, options.Limits(2, 10000)] = 60,
+    file: options.FileOptions,
+    max_gap: options.MaxGap = 80.0,
+    min_seconds: options.MinSeconds = 20.0,
+    dt: options.Step = None,
 ) -> None:
     """Estimate how unsteady drivers are: which quantity wanders, by how much (sigma), with which memory time (tau).
 
@@ -537,7 +523,7 @@ def drift(
 def predict(
     *,
     scenarios: list[Path],
-    job: JobOptions,
+    job: options.JobOptions,
 ) -> None:
     """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map.
 
@@ -558,7 +544,7 @@ def predict(
 
 @app.command()
 def effects(
-    model: Annotated[Path | None, POSITIONAL] = None,
+    model: Annotated[Path | None, options.POSITIONAL] = None,
     cite: bool = False,
     trust: bool = False,
 ) -> None:
@@ -606,9 +592,9 @@ def doctor() -> None:
 
 @app.command()
 def bench(
-    out: Path = OUT,
+    out: Path = options.OUT,
     sizes: str = "2000,20000,200000,2000000",
-    rounds: Annotated[int, Limits(1, 1000)] = 5,
+    rounds: Annotated[int, options.Limits(1, 1000)] = 5,
     compiled: bool = True,
     peers: bool = True,
     verbose: bool = False,
@@ -652,7 +638,7 @@ def _number(option: str, text: str, wrong: str) -> float:
 # Each command takes a file of the one before, in the help and on the site.
 for _command in app.registered_commands:
     assert _command.callback is not None
-    _command.cls, _command.callback = _Refusing, spread(_command.callback)
+    _command.cls, _command.callback = _Refusing, options.spread(_command.callback)
 
 
 def run() -> None:

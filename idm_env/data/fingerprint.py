@@ -24,12 +24,12 @@ of an hour on the same road 4 are taken for one of them."""
 _READABLE = re.compile(r"\d+( -?\d+){2,}")
 
 
-def marks(trajectories: Trajectories, drivers: Iterable[Track]) -> dict[Track, str]:
-    """Return the mark of a track by (run_id, vehicle_id): ``every first x x …``.
+def marks(trajectories: Trajectories, drivers: Iterable[Track]) -> list[str]:
+    """Return the marks of tracks, ``every first x x …;run/vehicle``, under their names in the file.
 
     The places x (m, rounded) are those at every multiple of ``every`` seconds of the file's clock, from ``first`` on.
     """
-    by_track = {}
+    lines = []
     for track, time, position in _tracks(trajectories, drivers):
         every = 1
         while time[-1] - time[0] >= every * MOST_PLACES:
@@ -37,41 +37,46 @@ def marks(trajectories: Trajectories, drivers: Iterable[Track]) -> dict[Track, s
         times = np.arange(np.ceil(time[0] / every), np.floor(time[-1] / every) + 1) * every
         if len(times):
             places = np.round(np.interp(times, time, position)).astype(int)
-            by_track[track] = " ".join(map(str, (every, int(times[0]), *places)))
-    return by_track
+            text = " ".join(map(str, (every, int(times[0]), *places)))
+            lines.append(f"{text};{trajectories.name_of(*track)}")
+    return sorted(lines)
 
 
-def seen(trajectories: Trajectories, drivers: Iterable[Track], old_marks: Iterable[str]) -> set[Track] | None:
-    """Return the drivers whose tracks have these ``old_marks``, whatever run and vehicle are called here.
+def seen(trajectories: Trajectories, drivers: Iterable[Track], old_marks: Iterable[str]) -> dict[Track, str] | None:
+    """Return, by driver, the name of the one of ``old_marks`` that his track has, whatever it is called here.
 
-    None where no mark can be read: there is none, or another version wrote them.
+    Drivers without one are absent. None where no mark can be read: there is none, or another version wrote them.
     """
-    times, places, owner, count = [], [], [], 0
-    for mark in filter(_READABLE.fullmatch, old_marks):
+    times, places, owner = [], [], []
+    names: list[str] = []
+    for mark, _, name in (text.partition(";") for text in old_marks):
+        if not _READABLE.fullmatch(mark):
+            continue
         every, first, *values = (int(x) for x in mark.split())
         times.append(first + every * np.arange(len(values)))
         places.append(np.array(values, float))
-        owner.append(np.full(len(values), count))
-        count += 1
-    if not count:
+        owner.append(np.full(len(values), len(names)))
+        names.append(name)
+    if not names:
         return None
     when, where, index = (np.concatenate(parts) for parts in (times, places, owner))
     order = np.argsort(when, kind="stable")
     when, where, index = when[order], where[order], index[order]
-    drivers_seen = set()
+    drivers_seen = {}
     for track, time, position in _tracks(trajectories, drivers):
         part = slice(*np.searchsorted(when, (time[0], time[-1] + 1e-6)))
         near = np.abs(np.interp(when[part], time, position) - where[part]) <= NEAR_M
-        shared = np.bincount(index[part], minlength=count)
-        alike = np.bincount(index[part], near, minlength=count)
-        if ((shared > 1) & (alike >= ALIKE * shared)).any():
-            drivers_seen.add(track)
+        shared = np.bincount(index[part], minlength=len(names))
+        alike = np.bincount(index[part], near, minlength=len(names))
+        same = np.flatnonzero((shared > 1) & (alike >= ALIKE * shared))
+        if len(same):
+            drivers_seen[track] = names[same[np.argmax(alike[same])]]
     return drivers_seen
 
 
 def fitted_on(trajectories: Trajectories, drivers: Iterable[Track]) -> dict[str, Any]:
     """Return what ``model.yaml`` says of the data of a fit: the file's name and the marks of its drivers' tracks."""
-    return {"source": trajectories.source, "tracks": sorted(set(marks(trajectories, drivers).values()))}
+    return {"source": trajectories.source, "tracks": marks(trajectories, drivers)}
 
 
 def _tracks(trajectories: Trajectories, drivers: Iterable[Track]) -> Iterator[tuple[Track, np.ndarray, np.ndarray]]:

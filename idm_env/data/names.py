@@ -187,13 +187,6 @@ def unread(columns: list[str]) -> list[Repair]:
     return [Repair("columns not read", len(looks), f"{len(looks)} {words}")] if looks else []
 
 
-def unit_in(column: str, name: str) -> str | None:
-    """Return the unit that the name of a column ends with, if it is one for ``name`` that is not its own."""
-    plain = _plain(column)
-    unit = next((u for u in UNITS.get(name, {}) if plain.endswith(f"_{u}")), None)
-    return unit if unit and UNITS[name][unit] != 1.0 else None
-
-
 def _plain(column: str) -> str:
     return re.sub(r"\W+", "_", re.sub(r"\s*[\[(].*[\])]\s*$", "", column).lower()).strip("_")
 

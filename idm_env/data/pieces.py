@@ -77,6 +77,7 @@ def split_runs(trajectories: Trajectories, seconds: float) -> Trajectories:
         table=pieces.drop("_piece", "_run").sort(*schema.TRACK, "time_s"),
         repairs=(*trajectories.repairs, Repair("recordings cut into runs", len(runs), text)),
         steps={run: trajectories.steps[old] for run, old in runs.items()},
+        recordings=runs,
         drivers=frozenset(home.select("run_id", "vehicle_id").rows()),
     )
 

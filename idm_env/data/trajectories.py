@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 
 import numpy as np
@@ -27,6 +27,7 @@ class Trajectories:
         steps: Time step of each run in s.
         place: Column that says where on the road a vehicle is, for places such as hills.
         drivers: If given, only these (run_id, vehicle_id) are drivers to fit; all others are still neighbours.
+        recordings: The run of the file, by run_id, of runs that were cut from it.
     """
 
     table: pl.DataFrame
@@ -35,6 +36,7 @@ class Trajectories:
     steps: dict[str, float]
     place: str = "position_m"
     drivers: frozenset[tuple[str, str]] | None = None
+    recordings: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def from_frame(
@@ -138,6 +140,10 @@ class Trajectories:
             self.table.filter(pl.col("leader_id").is_not_null()).select(schema.TRACK).unique(maintain_order=True).rows()
         )
         return [row for row in rows if self.drivers is None or row in self.drivers]
+
+    def name_of(self, run: str, vehicle: str) -> str:
+        """Return ``run/vehicle`` as the file has them."""
+        return f"{self.recordings.get(run, run)}/{vehicle}"
 
     def summary(self) -> dict[str, object]:
         """Return counts for a report: rows, runs, vehicles, followers, seconds, steps and repairs."""

@@ -181,7 +181,11 @@ def _saved(
         for law, mine in zip(judgement.fleet.laws, judgement.fleet.records, strict=True):
             its = of_laws.calibrated_among(law.model, mine)
             parts.append((prepared.some(mine), its, its))
-    return [replace(corrected(part, s, theta.theta, by), fitted_on=seen) for part, s, theta in parts]
+    names = {f"{run}/{vehicle}": trajectories.name_of(run, vehicle) for run, vehicle in trajectories.followers()}
+    models = [corrected(part, s, theta.theta, by) for part, s, theta in parts]
+    return [
+        replace(m, fitted_on=seen, drivers={names.get(key, key): own for key, own in m.drivers.items()}) for m in models
+    ]
 
 
 def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) -> SavedModel:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ import torch
 
 from idm_env.data import DataError, Episode, Episodes, Repair, Trajectories
 from idm_env.data.errors import by_kind
-from idm_env.data.fingerprint import marks, seen
+from idm_env.data.fingerprint import Track, marks, seen
 from idm_env.data.folder import FolderSlice, shares, stamp
 from idm_env.effects import Brakes, base_named
 from idm_env.fitting import drivers, pictures, pieces
@@ -120,7 +120,7 @@ def _fit_file(work: _Work) -> dict[str, Any]:
         left_out += lost
     data = {**trajectories.summary(), "left_out": [str(r) for r in chosen.left_out], "episodes": len(chosen)}
     data["account"] = page.account(by_kind(trajectories.repairs), by_kind(left_out))
-    result = _write(work, joined, held_out, data, marks(trajectories, _drivers(chosen)).values())
+    result = _write(work, joined, held_out, data, marks(trajectories, _drivers(chosen)))
     pooled.parts.remove()
     return result
 
@@ -139,7 +139,7 @@ def _fit_folder(work: _Work) -> dict[str, Any]:
 
 
 def _write(
-    work: _Work, joined: JoinedFit, held_out: dict[str, Any] | None, data: dict[str, Any], tracks: Iterable[str]
+    work: _Work, joined: JoinedFit, held_out: dict[str, Any] | None, data: dict[str, Any], tracks: list[str]
 ) -> dict[str, Any]:
     """Join the parts to the files that were promised, and return the report."""
     out, options, estimates = work.out, work.options, joined.estimates
@@ -176,7 +176,7 @@ def _write(
     table = rows.head(drivers.MOST_ROWS).collect().to_dicts()
     model = dataclasses.replace(model_of(estimates, options.by), substeps=options.substeps)
     if len(estimates.groups) <= MOST_DRIVERS:
-        model = dataclasses.replace(model, fitted_on={"source": data["source"], "tracks": sorted(set(tracks))})
+        model = dataclasses.replace(model, fitted_on={"source": data["source"], "tracks": sorted(tracks)})
     if failed:
         (out / "model.yaml").unlink(missing_ok=True)  # of an earlier fit
     else:
@@ -283,9 +283,8 @@ def _data_section(result: dict[str, Any]) -> list[page.Block]:
     ]
 
 
-def _overlap(model: Model, trajectories: Trajectories, items: Episodes, error: Errors) -> dict[str, Any]:
+def _overlap(model: Model, overlap: dict[Track, str] | None, items: Episodes, error: Errors) -> dict[str, Any]:
     """Return how many episodes are of tracks that the model was fitted on, the error on the others, and it in words."""
-    overlap = seen(trajectories, _drivers(items), model.fitted_on.get("tracks", ()))
     new = torch.tensor([driver not in (overlap or ()) for driver in _drivers(items)])
     count, others = int((~new).sum()), float(error.gap_rmse[new].mean()) if new.any() else None
     if overlap is None:
@@ -303,6 +302,14 @@ def _overlap(model: Model, trajectories: Trajectories, items: Episodes, error: E
         "source": model.fitted_on.get("source"), "episodes_fitted_on": None if overlap is None else count,
         "gap_rmse_of_others_m": None if overlap is None else others, "words": words,
     }  # fmt: skip
+
+
+def drivers_in_words(model: Model, matched: int, count: int) -> str:
+    """Return in words how many of so many episodes are of drivers that a model has."""
+    if not model.drivers:
+        return "The model has no drivers of its own: all have its parameters."
+    others = "" if matched == count else ", the others have its median parameters"
+    return f"{matched} of {count} stretches are of its {len(model.drivers)} drivers{others}."
 
 
 def simulate_file(
@@ -335,7 +342,8 @@ def _simulate_file(
     trajectories = source.trajectories()
     items = source.episodes(trajectories)
     progress("simulating", 0, 0, f"{len(items)} episodes")
-    problem, values, matched = problem_of(model, items, seed)
+    same = seen(trajectories, _drivers(items), model.fitted_on.get("tracks", ()))
+    problem, values, matched = problem_of(model, items, seed, same)
     with torch.no_grad():
         error, simulated = errors(problem, values, torch.zeros(0, dtype=values.dtype))
     progress("writing", 0, 0, "the report")
@@ -352,8 +360,9 @@ def _simulate_file(
             "account": page.account(by_kind(trajectories.repairs), by_kind(items.left_out)),
         },
         "drivers_with_own_parameters": matched,
+        "drivers": drivers_in_words(model, matched, len(items)),
         "error": error.summary(),
-        "fitted_on": _overlap(model, trajectories, items, error),
+        "fitted_on": _overlap(model, same, items, error),
         "seed": seed,
         "versions": page.versions(),
     }
@@ -361,8 +370,7 @@ def _simulate_file(
     blocks = [
         page.lead(
             f"{len(items)} episodes simulated behind their measured leaders: mean gap RMSE "
-            f"{error.summary()['gap_rmse_m']:.2f} m, {result['fitted_on']['words']} {matched} of them have driver "
-            "parameters of their own."
+            f"{error.summary()['gap_rmse_m']:.2f} m, {result['fitted_on']['words']} {result['drivers']}"
         ),
         page.table(in_words([error.summary()])),
         pictures.examples(problem, error, simulated),
@@ -386,8 +394,13 @@ def in_words(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [{title: row[name] for name, title in names.items() if name in row} for row in rows]
 
 
-def problem_of(model: Model, items: Episodes, seed: int = 0) -> tuple[Problem, torch.Tensor, int]:
-    """Return a problem with all P parameters of a model, their values [episodes, P] (SI), and the drivers matched."""
+def problem_of(
+    model: Model, items: Episodes, seed: int = 0, same: Mapping[Track, str] | None = None
+) -> tuple[Problem, torch.Tensor, int]:
+    """Return a problem with all P parameters of a model, their values [episodes, P] (SI), and how many drivers it has.
+
+    ``same`` are the names in the model of drivers whose tracks it was fitted on; others are looked for by their own.
+    """
     batch = Batch.stack(items, substeps=model.substeps)
     effects = behind_records(model)
     simulator = Simulator(Lane(), effects, dt=batch.step, integration=model.integration)
@@ -395,6 +408,8 @@ def problem_of(model: Model, items: Episodes, seed: int = 0) -> tuple[Problem, t
     try:
         groups, labels = group_of(batch.episodes, model.by)
         keys = [labels[i] for i in groups.tolist()]
+        if model.by == "driver":
+            keys = [(same or {}).get(track, key) for track, key in zip(_drivers(items), keys, strict=True)]
     except DataError:  # these data lack the column by which the drivers were told apart
         keys = [""] * len(batch)
     owns = [key if key in model.drivers else None for key in keys]

@@ -85,7 +85,7 @@ def _fit_piece(piece: Piece, on_progress: OnProgress) -> None:
             parts.finish(number, {"lost": str(wrong), "share": str(piece.data)})
             return
         summary = _summary(trajectories, items.left_out)
-        summary["tracks"] = sorted(set(marks(trajectories, [(e.run_id, e.vehicle_id) for e in items]).values()))
+        summary["tracks"] = marks(trajectories, [(e.run_id, e.vehicle_id) for e in items])
         data: Sequence[Episode] = items
     else:
         data = piece.data

@@ -6,6 +6,7 @@ import polars as pl
 import pytest
 
 from idm_env.data import DataError, Trajectories, pieces
+from idm_env.data.fingerprint import fitted_on
 
 
 def passing(stay: float, every: float, seconds: float = 480.0) -> Trajectories:
@@ -29,6 +30,8 @@ def test_every_driver_counts_in_one_run_and_keeps_his_neighbours() -> None:
     assert sorted(vehicle for _, vehicle in cut.followers()) == sorted(vehicle for _, vehicle in whole.followers())
     spans = cut.table.group_by("run_id").agg(pl.col("time_s").max() - pl.col("time_s").min())["time_s"]
     assert spans.max() <= 60.0
+    names = {mark.partition(";")[2] for mark in fitted_on(cut, cut.followers())["tracks"]}
+    assert names == {f"0/{vehicle}" for _, vehicle in whole.followers()}  # as the file has them
     part = whole.where("vehicle_id=7")
     with pytest.raises(DataError, match="only 1 would have drivers of their own"):
         pieces.split_runs(part, 60.0)

@@ -17,7 +17,7 @@ from idm_env.fitting.evaluate import Errors
 from idm_env.fitting.job import FITTED, fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
 from idm_env.model_file import load_model
-from tests.commands import run
+from tests.commands import run, typed
 
 
 @pytest.fixture(scope="module")
@@ -243,3 +243,14 @@ def test_what_a_failed_fit_is(on: int, rmse: float, smallest: float, words: str)
     rows = [row(f"parameter {n}", int(n < on), 1) for n in range(5)]
     told = failure(rows, error)
     assert words in told and bool(told) == bool(words)
+
+
+def test_drivers_of_a_model_are_found_by_their_tracks(file: Path, tmp_path: Path) -> None:
+    """In the same traffic under other names; every command says how many it found."""
+    fitted = fit_file(Source(file), Options(starts=1), tmp_path / "fit")
+    named = pl.read_csv(file).with_columns(pl.format("x{}", "run_id").alias("run_id"))
+    named.write_csv(tmp_path / "named.csv")
+    done = typed("simulate", tmp_path / "named.csv", "--model", tmp_path / "fit" / "model.yaml", "--out", tmp_path)
+    assert "8 of 8 stretches are of its 8 drivers." in done.stderr
+    result = json.loads((tmp_path / "report.json").read_text())
+    assert result["error"]["gap_rmse_m"] == pytest.approx(fitted["fit"]["gap_rmse_m"], rel=1e-6)
