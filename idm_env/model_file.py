@@ -240,9 +240,13 @@ def make_effects(descriptions: Iterable[str | Mapping[str, Any] | Effect]) -> tu
     return tuple(effects)
 
 
-def numbers(values: Mapping[str, Any]) -> Numbers:
-    """Return effect → parameter → number; ``{"idm.time_gap": 1.2}`` and ``{"idm": {"time_gap": 1.2}}`` are the same."""
-    return {e: {n: number(f"{e}.{n}", x) for n, x in part.items()} for e, part in nested(values).items()}
+def numbers(values: Mapping[str, Any], of: str = "") -> Numbers:
+    """Return effect → parameter → number; ``{"idm.time_gap": 1.2}`` and ``{"idm": {"time_gap": 1.2}}`` are the same.
+
+    ``of`` is the key that errors name.
+    """
+    parts, prefix = nested(values, of or "parameters"), f"{of}." if of else ""
+    return {e: {n: number(f"{prefix}{e}.{n}", x) for n, x in part.items()} for e, part in parts.items()}
 
 
 def nested(values: Mapping[str, Any], of: str = "parameters") -> dict[str, dict[str, Any]]:

@@ -36,6 +36,7 @@ class Parameter:
     is found: a *strength* has a gradient at its null; a *shape* matters only once the strength does; a *threshold* or
     a *place* has to be searched, from ``starts`` where given. ``searched`` are bounds of the search for a missing
     effect, where these are other than (low, high): wider than plausible, narrower than where IDM would collide.
+    ``most`` names another parameter of the effect, in the same unit, that it does not exceed.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Parameter:
     role: Role = "strength"
     starts: tuple[float, ...] = ()
     searched: tuple[float, float] | None = None
+    most: str = ""
 
     def __post_init__(self) -> None:
         if not self.low < self.high or not self.low <= self.default <= self.high:
@@ -170,6 +172,11 @@ def check(effects: Iterable[HasParameters], params: Params) -> None:
             worst = float(value[bad].reshape(-1)[0])
             unit = "" if p.unit == "1" else f" {p.unit}"
             raise ValueError(f"{full} = {worst:g}{unit} is outside [{p.low:g}, {p.high:g}]{unit}.")
+        if p.most and bool((value > (1.0 + 1e-6) * torch.as_tensor(params[effect][p.most]).detach()).any()):
+            raise ValueError(
+                f"{full} = {float(value.max()):g} {p.unit} must not exceed {effect}.{p.most} = "
+                f"{float(torch.as_tensor(params[effect][p.most]).min()):g} {p.unit}."
+            )
 
 
 def replaced(params: Mapping[str, Mapping[str, V]], values: Mapping[str, V]) -> dict[str, dict[str, V]]:

@@ -105,9 +105,9 @@ class Trips(NamedTuple):
         if len(counts) > 1 or 0 in counts:
             raise ValueError("trips: every column must have a value for each trip, and at least one.")
         numbers = []
-        for name, least in (("depart", 0.0), ("lane", 0.0), ("speed", 1.0)):
+        for name, (least, most) in {"depart": (0.0, 1e9), "lane": (0.0, 1e3), "speed": (1.0, 100.0)}.items():
             column = list(frame[name]) if name in names else [ENTRY_SPEED] * max(counts)
-            numbers.append([_number(name, value, row, least) for row, value in enumerate(column)])
+            numbers.append([_number(name, value, row, least, most) for row, value in enumerate(column)])
         depart, lane, speed = (torch.tensor(x, dtype=torch.float64) for x in numbers)
         order = depart.argsort(stable=True)
         none = torch.zeros(len(order), dtype=torch.int64)
@@ -115,14 +115,16 @@ class Trips(NamedTuple):
         return cls(depart[order].to(dtype), again, lane[order].long(), speed[order].to(dtype), none, none.clone())
 
 
-def _number(name: str, value: Any, row: int, least: float) -> float:
+def _number(name: str, value: Any, row: int, least: float, most: float) -> float:
     """Return a value of a trip as a number; ValueError, in one line, for what is none."""
+    kind, shown = str(getattr(value, "dtype", type(value).__name__)), " ".join(f"{value!r:.80}".split())
     try:
-        number = float(value)
-    except (TypeError, ValueError):
+        number = math.nan if kind.endswith(("bool", "bytes")) else float(value)
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
-    if not least <= number < math.inf:
-        raise ValueError(f"trips: {name} = {value!r} of row {row} must be a number of at least {least:g}.")
+    if not least <= number <= most:
+        rule = f"at most {most:g}" if number > most else f"at least {least:g}"
+        raise ValueError(f"trips: {name} = {shown} of row {row} must be a number of {rule}.")
     if name == "lane" and number != int(number):
         raise ValueError(f"trips: lane = {number:g} of row {row} must be a whole number.")
     return number

@@ -205,13 +205,7 @@ def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress)
 
 
 @app.command("filter")
-def filter_(
-    *,
-    data: Path,
-    job: options.JobOptions,
-    tracks: options.TrackOptions,
-    trust: bool = False,
-) -> None:
+def filter_(*, data: Path, job: options.JobOptions, tracks: options.TrackOptions, trust: bool = False) -> None:
     """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters.
 
     Args:
@@ -520,11 +514,7 @@ def drift(
 
 
 @app.command()
-def predict(
-    *,
-    scenarios: list[Path],
-    job: options.JobOptions,
-) -> None:
+def predict(*, scenarios: list[Path], job: options.JobOptions) -> None:
     """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map.
 
     Args:
@@ -543,11 +533,7 @@ def predict(
 
 
 @app.command()
-def effects(
-    model: Annotated[Path | None, options.POSITIONAL] = None,
-    cite: bool = False,
-    trust: bool = False,
-) -> None:
+def effects(model: Annotated[Path | None, options.POSITIONAL] = None, cite: bool = False, trust: bool = False) -> None:
     """List the catalogue of effects, or the effects of a model, with their parameters or their publications.
 
     Args:

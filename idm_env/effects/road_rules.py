@@ -148,7 +148,7 @@ class Signal(Effect):
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("place", "x_s", "m", 400.0, -1e6, 1e6, role="place"),
         Parameter("cycle", "C", "s", 60.0, 1.0, 3600.0, role="shape"),
-        Parameter("red", "r", "s", 30.0, 0.0, 3600.0, null=0.0, role="threshold"),
+        Parameter("red", "r", "s", 30.0, 0.0, 3600.0, null=0.0, role="threshold", most="cycle"),
         Parameter("offset", "φ", "s", 0.0, -3600.0, 3600.0, role="shape"),
         Parameter("most_decel", "b_m", "m/s²", 3.0, 0.5, 9.0, role="threshold"),
     )

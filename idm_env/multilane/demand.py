@@ -65,7 +65,7 @@ def trips(
 
 def evenly(
     per_hour: Mapping[int, float], counts: Mapping[int, int], first: int
-) -> tuple[list[float], list[float], list[int]]:  # fmt: skip
+) -> tuple[list[float], list[float], list[int]]:
     """Return when the trips of so many slots of each lane begin (s), after how long again (s), and their lanes.
 
     ``first`` is how many intervals the first trip of a lane waits.
@@ -93,7 +93,7 @@ def waiting(stepping: CarFollowingStep, schedule: Trips, params: Params, *, leng
     begin = begins[schedule.lane.clamp(0, len(begins) - 1)]
     state = stepping.state(
         begin, schedule.speed, params, length=length, lane=schedule.lane, present=torch.zeros_like(begin)
-    )  # fmt: skip
+    )
     assert state.lanes is not None
     return state._replace(lanes=state.lanes._replace(trips=schedule))
 

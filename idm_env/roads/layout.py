@@ -6,7 +6,7 @@ Shapes: what belongs to vehicles is ``[..., n]``, places are in m.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ ENDLESS = 1e9
 
 
 Where = Literal["begins", "opens", "closes", "stops", "leaves"]
+WHERE: tuple[Where, ...] = get_args(Where)
 
 
 @dataclass(frozen=True)

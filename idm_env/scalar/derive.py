@@ -83,9 +83,7 @@ RULES: dict[str, Callable[[Graph, Node, Node], list[Share]]] = {
     "log": lambda graph, node, g: [(0, graph.div(g, node.args[0]))],
     "log1p": lambda graph, node, g: [(0, graph.div(g, graph.add(node.args[0], graph.constant(1.0))))],
     "tanh": lambda graph, node, g: [(0, graph.mul(g, graph.sub(graph.constant(1.0), graph.mul(node, node))))],
-    "sigmoid": lambda graph, node, g: [
-        (0, graph.mul(g, graph.mul(node, graph.sub(graph.constant(1.0), node))))
-    ],
+    "sigmoid": lambda graph, node, g: [(0, graph.mul(g, graph.mul(node, graph.sub(graph.constant(1.0), node))))],
     "sin": lambda graph, node, g: [(0, graph.mul(g, graph.node("cos", node.args[0])))],
     "cos": lambda graph, node, g: [(0, graph.neg(graph.mul(g, graph.node("sin", node.args[0]))))],
     "relu": lambda graph, node, g: [(0, _masked(graph, "gt", node.args[0], graph.constant(0.0), g))],
@@ -96,7 +94,7 @@ RULES: dict[str, Callable[[Graph, Node, Node], list[Share]]] = {
     "floor": lambda graph, node, g: [],
     "sign": lambda graph, node, g: [],
     "detach": lambda graph, node, g: [],
-}  # fmt: skip
+}
 """Operation → the adjoints of its arguments from that of its result."""
 
 

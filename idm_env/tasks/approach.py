@@ -123,6 +123,13 @@ class ApproachTask(OpenLanesTask):
     def _ranges(self) -> dict[tuple[str, str], tuple[float, float]]:
         return {("signal", "offset"): (0.0, self.cycle), **super()._ranges}
 
+    def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
+        """Return checked parameters as tensors; ValueError for a signal elsewhere, as observations count from it."""
+        values = super().params(dtype, device)
+        if bool((values["signal"]["place"] != LINE).any()):
+            raise ValueError(f"signal.place must be {LINE:g} m in task '{self.name}'. Leave it out.")
+        return values
+
     @property
     def inflows(self) -> Mapping[int, float]:
         """The same for each lane."""

@@ -20,10 +20,11 @@ import torch
 from torch import Tensor
 
 from idm_env.effects import Control, Effect, Noise
+from idm_env.parameters import catalogue
 from idm_env.roads import Road
 from idm_env.simulator import Simulator, stacked
 from idm_env.tasks.behaviour import Behaviour, behaviour
-from idm_env.tasks.checks import Range, agents_of, in_ranges, limits_of, ranges, ranges_of, two_ends, whole
+from idm_env.tasks.checks import Range, agents_of, in_ranges, limits_of, ranges, ranges_of, two_ends
 from idm_env.tasks.crash import contact, lawful_cost
 from idm_env.tasks.declared import one_declared
 from idm_env.tasks.failsafe import safe_accel
@@ -32,10 +33,9 @@ from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition, Weighted, weighted
 from idm_env.tasks.types import Bounds, Ended, EnvState, Features, RewardRange
 from idm_env.types import Command, Inputs, Params, State, mapped
-from idm_env.validation import shown
+from idm_env.validation import whole
 
 _NORMALS_AT_ONCE = 1 << 16
-_MOST_STEPS = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -130,6 +130,7 @@ class Task(abc.ABC):
         "failsafe_time": Range(0.0, 60.0, "s"),
         "hold": Range(1e-3, 60.0, "s"),
         "crash_cost": Range(0.0, 1e12),
+        "max_episode_steps": Range(-1, 1e9, whole=True),
     }
     """Where numbers may lie: of a kind of task its own, beside those that it inherits."""
     usual_hold: ClassVar[float | None] = None
@@ -154,14 +155,8 @@ class Task(abc.ABC):
     def _check_episode(self) -> None:
         """Check what every task says of its commands, episodes and observations."""
         limits_of(self.max_command)
-        steps = self.max_episode_steps
-        if steps is not None and (
-            isinstance(steps, bool) or not isinstance(steps, int) or not (1 <= steps <= _MOST_STEPS or steps == -1)
-        ):
-            raise ValueError(
-                f"max_episode_steps = {shown(steps)} must be a whole number of at least 1 and at most {_MOST_STEPS}, "
-                "or -1 for no limit."
-            )
+        if self.max_episode_steps == 0:
+            raise ValueError("max_episode_steps = 0 must be at least 1, or -1 for no limit.")
         _ = self.scaling, self.weighted
 
     # -- static facts --------------------------------------------------------------------------------------------
@@ -365,10 +360,12 @@ class Task(abc.ABC):
             if isinstance(self.randomise, Mapping)
             else self.randomise
         )
-        for end in (0, 1) if spans else ():
+        below = {full for full, p in catalogue(self._behaviour.effects).items() if p.most}
+        for end in ("lowest", "highest", "nearest") if spans else ():  # the last: what another bounds, against it
             values = {effect: dict(part) for effect, part in self._behaviour.parameters.items()}
             for (effect, name), ends in spans.items():
-                values.setdefault(effect, {})[name] = ends[end]
+                high = end == "highest" or (end == "nearest" and f"{effect}.{name}" in below)
+                values.setdefault(effect, {})[name] = ends[high]
             ends_of = replace(self._behaviour, parameters=values)
             self.simulator.check(ends_of.params(self.vehicles, torch.float64, "cpu"))
         return spans

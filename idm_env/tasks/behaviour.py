@@ -89,7 +89,7 @@ def behaviour(
     chosen += [e for e in required if e.name not in names]
     all_names = {e.name for e in chosen}
     values = {effect: dict(part) for effect, part in values.items() if effect in all_names}
-    for key, change in nested(changes or {}).items():
+    for key, change in nested({} if changes is None else changes).items():
         values.setdefault(key, {}).update(change)
         single = {name: x for name, x in single.items() if name[0] != key or name[1] not in change}
     step = number("dt", 0.1 if dt is None else dt)

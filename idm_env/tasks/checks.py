@@ -4,24 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from idm_env.model_file import nested
-from idm_env.validation import at_least, finite, shown, whole
-
-__all__ = [
-    "KeywordError",
-    "Range",
-    "agents_of",
-    "at_least",
-    "in_ranges",
-    "limits_of",
-    "only_with",
-    "ranges",
-    "span",
-    "whole",
-]
+from idm_env.validation import at_least, finite, nearest, shown, whole
 
 _WEAKEST, _STRONGEST = 1e-3, 100.0
 
@@ -53,6 +40,64 @@ class Range(NamedTuple):
 
 
 FLOW = Range(0.0, 1e5, "vehicles an hour")
+
+
+class Key(NamedTuple):
+    """What one key of a nested keyword takes, a range or a check, and its usual value.
+
+    Without a ``usual`` value it must be given. None stands for what the road decides, where that is usual.
+    """
+
+    kind: Range | Callable[[str, Any], object]
+    usual: Any = ...
+
+
+def _listed(keys: Mapping[str, Key]) -> str:
+    """Return the names of keys with their units, as a sentence lists them."""
+    units = {name: key.kind.unit for name, key in keys.items() if isinstance(key.kind, Range) and key.kind.unit}
+    return " and ".join(", ".join(f"{x} ({units[x]})" if x in units else x for x in keys).rsplit(", ", 1))
+
+
+def entry(where: str, given: Any, keys: Mapping[str, Key]) -> dict[str, Any]:
+    """Return the values of a nested keyword, with the usual ones of keys that are left out.
+
+    ValueError, in one line, for no mapping, an unknown or a missing key, and a value of a wrong type or out of range.
+    """
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{where} = {shown(given)} must be a mapping of {_listed(keys)}.")
+    if strange := [name for name in given if name not in keys]:
+        like = nearest(shown(strange[0]).strip("'"), keys)
+        raise ValueError(f"{where} has an unknown key {shown(strange[0])}.{like}")
+    needed = {name: key for name, key in keys.items() if key.usual is ...}
+    if needed.keys() - given.keys():
+        raise ValueError(f"{where} = {shown(given)} must give {_listed(needed)}.")
+    values = {name: given.get(name, key.usual) for name, key in keys.items()}
+    for name, (kind, usual) in keys.items():
+        if not (values[name] is None and usual is None):
+            (kind.check if isinstance(kind, Range) else kind)(f"{where}.{name}", values[name])
+    return values
+
+
+def entries(where: str, given: Any, keys: Mapping[str, Key]) -> list[tuple[str, dict[str, Any]]]:
+    """Return the name and the values of every entry of a list, as ``entry`` does. ValueError for no list of such."""
+    if not isinstance(given, Sequence) or isinstance(given, str | bytes):
+        raise ValueError(f"{where} = {shown(given)} must be a list of mappings of {_listed(keys)}.")
+    names = [f"{where}[{i}]" for i in range(len(given))]
+    return [(name, entry(name, one, keys)) for name, one in zip(names, given, strict=True)]
+
+
+def text(where: str, value: Any) -> str:
+    """Return a text that is not empty. ValueError, in one line, for anything else."""
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"{where} = {shown(value)} must be a text that is not empty.")
+    return value
+
+
+def by_name(where: str, given: Any) -> dict[str, Any]:
+    """Return a mapping from names. ValueError, in one line, for anything else."""
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{where} = {shown(given)} must be a mapping from names.")
+    return {text(f"{where}: a name", name): value for name, value in given.items()}
 
 
 def ranges(task: type) -> dict[str, Range]:
@@ -104,7 +149,7 @@ def span(name: str, value: Any, low: float, unit: str, high: float = math.inf) -
 def ranges_of(randomise: Mapping[str, Any] | None) -> dict[tuple[str, str], tuple[float, float]]:
     """Return what episodes draw parameters from, by effect and name. ValueError for what is no range."""
     spans = {}
-    for effect, part in nested(randomise or {}, "randomise").items():
+    for effect, part in nested({} if randomise is None else randomise, "randomise").items():
         for name, value in part.items():
             spans[effect, name] = two_ends(f"randomise.{effect}.{name}", value)
     return spans

@@ -48,10 +48,7 @@ class HighwayTask(LanesTask):
         "idm": {"max_accel": 1.5, "comfort_decel": 2.0, "time_gap": 1.2, "min_gap": 2.0, "desired_speed": 30.0}
     }
 
-    ranges: ClassVar[Mapping[str, Range]] = {
-        "lanes_count": Range(2, 100, whole=True),
-        "length": Range(10.0, 1e6, "m"),
-    }
+    ranges: ClassVar[Mapping[str, Range]] = {"lanes_count": Range(2, 100, whole=True), "length": Range(10.0, 1e6, "m")}
 
     vehicles: int = 50
     lanes_count: int = 4

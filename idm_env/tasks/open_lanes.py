@@ -28,17 +28,17 @@ from idm_env.metrics import CO2, fuel
 from idm_env.multilane import demand
 from idm_env.roads import Lanes
 from idm_env.tasks.base import EnvState
-from idm_env.tasks.checks import FLOW, Range, at_least
+from idm_env.tasks.checks import FLOW, Range, entry
 from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import RewardTerm, Transition
 from idm_env.tasks.said_roads import STANDS, DriverClass, Loop, classes_of, lengths, loops_of, rules_of, with_classes
 from idm_env.tasks.starting_places import with_room
-from idm_env.tasks.trip_table import TripTable, read, spread
+from idm_env.tasks.trip_table import KEYS, TripTable, read, spread
 from idm_env.tasks.trip_table import table as made
 from idm_env.types import ENTRY_SPEED, Params, State, Trips
-from idm_env.validation import nearest, one_of, shown
+from idm_env.validation import at_least, nearest, shown
 
 _PLACE_STREAM = 37
 _SIGHT = 500.0
@@ -156,7 +156,7 @@ class OpenLanesTask(LanesTask):
         if self.table is not None:
             object.__setattr__(self, "vehicles", len(self.table.depart))
         super().__post_init__()
-        _ = self.loops
+        _ = self.loops, self.kinds
         if self.added and self.failsafe:
             raise ValueError(
                 f"failsafe = {self.failsafe:g} judges whole commands, and added = True gives parts. Leave one out."
@@ -165,6 +165,8 @@ class OpenLanesTask(LanesTask):
             self._check_table(self.table)
             return
         flows = self.inflows
+        for lane, flow in flows.items():
+            at_least(f"inflow of lane {lane}", flow, 1.0, "vehicles an hour")
         total = sum(flows.values())
         round_trip, free = 3600.0 * self.vehicles / (total * self._busiest), (self.road.length or 0) / self.entry_speed
         if self._demands and round_trip < free:
@@ -174,7 +176,6 @@ class OpenLanesTask(LanesTask):
                 f"{math.ceil(total * self._busiest * free / 3600.0)}."
             )
         for lane, flow in flows.items():
-            at_least(f"inflow of lane {lane}", flow, 1.0, "vehicles an hour")
             if self.vehicles * flow < total:
                 raise ValueError(
                     f"vehicles = {self.vehicles} leaves none for lane {lane}, where {flow:g} of {total:g} vehicles an "
@@ -220,9 +221,7 @@ class OpenLanesTask(LanesTask):
         if self.trips is None:
             return None
         if isinstance(self.trips, Mapping) and "per_hour" in self.trips:
-            for key in self.trips:
-                one_of("trips", key, ("per_hour", "seconds", "seed", "speed", "classes", "destinations"))
-            return read(made(**{"seconds": 600.0, **self.trips}))
+            return read(made(**entry("trips", self.trips, KEYS)))
         return read(self.trips)
 
     @property
@@ -247,12 +246,12 @@ class OpenLanesTask(LanesTask):
     @cached_property
     def rules(self) -> tuple[Effect, ...]:
         """What the road tells its drivers."""
-        return rules_of(self.limits, self.closed, self.road.count)
+        return rules_of(self.limits, self.closed, self.road)
 
     @cached_property
     def loops(self) -> tuple[Loop, ...]:
         """The detectors."""
-        return loops_of(self.detectors, self.road.count, float(self.road.length or 0.0), self.simulator.dt)
+        return loops_of(self.detectors, self.road, self.simulator.dt)
 
     @property
     def closed(self) -> Sequence[Mapping[str, Any]]:

@@ -60,6 +60,9 @@ class OpenHighwayTask(OpenLanesTask):
             None if x is None else span(name, x, 0.0, "m", self.length)
             for name, x in (("on_ramp", self.on_ramp), ("off_ramp", self.off_ramp))
         )
+        for name, ends in (("on_ramp", on), ("off_ramp", off)):
+            if ends and not ends[0] < ends[1]:
+                raise ValueError(f"{name} = {list(ends)} must be [begin, end] (m), one behind the other.")
         if on and off and off[0] <= on[1]:
             raise ValueError(f"off_ramp = {list(off)} must begin behind the end of the on-ramp at {on[1]:g} m.")
         return on, off

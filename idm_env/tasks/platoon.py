@@ -14,13 +14,14 @@ from torch import Tensor
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import EnvState
-from idm_env.tasks.checks import Range, at_least, span
+from idm_env.tasks.checks import Range, span
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import FEATURES, AgentView, Feature, feature, speed
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import BehindHeadTask
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition, headway
 from idm_env.types import Params
+from idm_env.validation import at_least
 
 _WAVE_STREAM = 21
 _WAVES = 3

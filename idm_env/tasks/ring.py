@@ -16,13 +16,13 @@ from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Ring, Road
 from idm_env.tasks.base import EnvState, Task
-from idm_env.tasks.checks import Range, at_least, only_with, span
+from idm_env.tasks.checks import Range, only_with, span
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import Feature, feature, time_gap
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition
 from idm_env.types import Command, Inputs, Params, State
-from idm_env.validation import one_of, shown
+from idm_env.validation import at_least, one_of, shown
 
 STARTS = ("uniform", "wave")
 SCALES = (5.0, 1.0, 10.0)

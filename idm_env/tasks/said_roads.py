@@ -10,15 +10,29 @@ from torch import Tensor
 
 from idm_env.effects import Effect, LaneClosure, SpeedLimit
 from idm_env.effects.road_rules import EVERY_LANE
-from idm_env.model_file import nested
+from idm_env.model_file import numbers
+from idm_env.roads import Lanes
+from idm_env.roads.layout import ENDLESS, WHERE
 from idm_env.tasks import trip_table as table
-from idm_env.tasks.checks import at_least
-from idm_env.validation import one_of, shown
+from idm_env.tasks.checks import Key, Range, by_name, entries, entry, text
+from idm_env.validation import at_least
 
 STANDS = 0.5
 """Below this speed (m/s) a vehicle stands."""
 ALWAYS = 1e9
 """Since when and until when (s) where nothing is said."""
+
+
+_LANE, _PLACE, _TIME = Range(0, 1000, whole=True), Range(0.0, 1e6, "m"), Range(-ALWAYS, ALWAYS, "s")
+_WHERE = {"lane": Key(_LANE), "begin": Key(_PLACE, 0.0), "end": Key(_PLACE, None)}
+_LENGTH, _EVERY = Range(0.1, 100.0, "m"), Range(1e-3, 1e6, "s")
+KEYS: Mapping[str, Mapping[str, Key]] = {
+    "classes": {"share": Key(Range(0.0, 1.0), 0.0), "length": Key(_LENGTH, None), "parameters": Key(by_name, None)},
+    "limits": {**_WHERE, "lane": Key(_LANE, None), "speed": Key(Range(0.1, 100.0, "m/s"))},
+    "closures": {**_WHERE, "since": Key(_TIME, -ALWAYS), "until": Key(_TIME, ALWAYS)},
+    "detectors": {"lane": Key(_LANE), "place": Key(_PLACE), "every": Key(_EVERY, 30.0), "name": Key(text, None)},
+}
+"""What the keys of nested keywords take; a road's own bounds are narrower."""
 
 
 class DriverClass(NamedTuple):
@@ -32,30 +46,30 @@ class DriverClass(NamedTuple):
 def classes_of(given: Mapping[str, Any] | None, usual: float) -> dict[str, DriverClass]:
     """Return the classes by name; ValueError, in one line, for what cannot be."""
     classes = {}
-    for name, entry in (given or {}).items():
-        if not isinstance(entry, Mapping):
-            raise ValueError(f"classes.{name} = {shown(entry)} must give share, length (m) and parameters.")
-        for key in entry:
-            one_of(f"classes.{name}", key, ("share", "length", "parameters"))
-        length = at_least(f"classes.{name}.length", entry.get("length", usual), 0.1, "m", 100.0)
-        parameters = nested(entry.get("parameters") or {}, f"classes.{name}.parameters")
-        classes[str(name)] = DriverClass(entry.get("share", 0.0), length, parameters)
+    for name, value in by_name("classes", {} if given is None else given).items():
+        share, length, parameters = entry(f"classes.{name}", value, KEYS["classes"]).values()
+        own = numbers(parameters or {}, f"classes.{name}.parameters")
+        classes[name] = DriverClass(share, usual if length is None else length, own)
     table.shares("classes", {name: x.share for name, x in classes.items()})
     return classes
 
 
-def _stretch(where: str, entry: Any, keys: Sequence[str], lanes: int) -> tuple[float, float, float]:
-    """Return lane (−1 for all), beginning and end (m) of what is said of a stretch."""
-    if not isinstance(entry, Mapping):
-        raise ValueError(f"{where} = {shown(entry)} must give {', '.join(keys)}.")
-    for key in entry:
-        one_of(where, key, keys)
-    lane = entry.get("lane")
-    if lane is not None and not (isinstance(lane, int) and not isinstance(lane, bool) and 0 <= lane < lanes):
-        raise ValueError(f"{where}.lane = {shown(lane)} does not exist: this road has lanes 0 to {lanes - 1}.")
-    begin = at_least(f"{where}.begin", entry.get("begin", 0.0), 0.0, "m", 1e6)
-    end = at_least(f"{where}.end", entry.get("end", 1e6), 0.0, "m", 1e6)
-    return float(EVERY_LANE if lane is None else lane), begin, end
+def _lane(where: str, values: Mapping[str, Any], road: Lanes) -> float:
+    """Return a lane, −1 for all. ValueError for one that the road does not have."""
+    lane = values["lane"]
+    if lane is not None and lane >= road.count:
+        raise ValueError(f"{where}.lane = {lane} does not exist: this road has lanes 0 to {road.count - 1}.")
+    return float(EVERY_LANE if lane is None else lane)
+
+
+def _stretch(where: str, values: Mapping[str, Any], road: Lanes) -> tuple[float, float, float]:
+    """Return lane (−1 for all), beginning and end (m) of a stretch. ValueError for one that is not on the road."""
+    length = road.length or ENDLESS
+    begin = at_least(f"{where}.begin", values["begin"], 0.0, "m", length)
+    end = length if values["end"] is None else at_least(f"{where}.end", values["end"], 0.0, "m", length)
+    if not begin < end:
+        raise ValueError(f"{where} from {begin:g} m to {end:g} m must end behind its beginning.")
+    return _lane(where, values, road), begin, 1e6 if values["end"] is None else end
 
 
 class Loop(NamedTuple):
@@ -67,55 +81,59 @@ class Loop(NamedTuple):
     every: float
 
 
-def loops_of(detectors: Any, lanes: int, length: float, dt: float) -> tuple[Loop, ...]:
+def loops_of(detectors: Any, road: Lanes, dt: float) -> tuple[Loop, ...]:
     """Return detectors; ValueError, in one line, for what cannot be."""
     loops = []
-    for i, detector in enumerate(detectors):
-        where = f"detectors[{i}]"
-        lane = int(_stretch(where, detector, ("lane", "place", "every", "name"), lanes)[0])
-        if lane == EVERY_LANE or "place" not in detector:
-            raise ValueError(f"{where} = {shown(detector)} must give lane and place (m).")
-        place = at_least(f"{where}.place", detector["place"], 0.1, "m", length)
-        every = at_least(f"{where}.every", detector.get("every", 30.0), dt, "s", 1e6)
+    for where, values in entries("detectors", detectors, KEYS["detectors"]):
+        lane = int(_lane(where, values, road))
+        place = at_least(f"{where}.place", values["place"], 0.1, "m", road.length or ENDLESS)
+        every = at_least(f"{where}.every", values["every"], dt, "s")
         if abs(every / dt - round(every / dt)) > 1e-6:
             raise ValueError(f"{where}.every = {every:g} s must be whole steps of {dt:g} s.")
-        loops.append(Loop(str(detector.get("name", f"lane {lane} at {place:g} m")), lane, place, every))
+        loops.append(Loop(values["name"] or f"lane {lane} at {place:g} m", lane, place, every))
     return tuple(loops)
 
 
-def rules_of(limits: Any, closures: Any, lanes: int) -> tuple[Effect, ...]:
+def rules_of(limits: Any, closures: Any, road: Lanes) -> tuple[Effect, ...]:
     """Return the effects of speed limits and closed lanes; ValueError, in one line, for what cannot be."""
-    rules: list[Effect] = []
-    zones = []
-    for i, entry in enumerate(limits):
-        where = _stretch(f"limits[{i}]", entry, ("lane", "begin", "end", "speed"), lanes)
-        if "speed" not in entry:
-            raise ValueError(f"limits[{i}] has no speed (m/s).")
-        zones.append((*where, at_least(f"limits[{i}].speed", entry["speed"], 0.1, "m/s", 100.0)))
-    if zones:
-        rules.append(SpeedLimit(zones=tuple(zones)))
-    rows = []
-    for i, entry in enumerate(closures):
-        where = _stretch(f"closures[{i}]", entry, ("lane", "begin", "end", "since", "until"), lanes)
-        if where[0] == EVERY_LANE:
-            raise ValueError(f"closures[{i}] must name one lane.")
-        since, until = (float(entry.get(name, usual)) for name, usual in (("since", -ALWAYS), ("until", ALWAYS)))
-        rows.append((*where, since, until))
-    _leaves_a_way(rows, lanes)
-    if rows:
-        rules.append(LaneClosure(closures=tuple(rows)))
-    return tuple(rules)
+    zones, rows = list[tuple[float, ...]](), list[tuple[float, ...]]()
+    for where, values in entries("limits", limits, KEYS["limits"]):
+        zones.append((*_stretch(where, values, road), float(values["speed"])))
+    for where, values in entries("closures", closures, KEYS["closures"]):
+        since, until = float(values["since"]), float(values["until"])
+        if not since < until:
+            raise ValueError(f"{where} from {since:g} s to {until:g} s must end after its beginning.")
+        rows.append((*_stretch(where, values, road), since, until))
+    for time in sorted({row[3] for row in rows}):
+        _leaves_a_way([row[:3] for row in rows if row[3] <= time < row[4]], road, time)
+    rules = (SpeedLimit(zones=tuple(zones)), LaneClosure(closures=tuple(rows)))
+    return tuple(rule for rule, needed in zip(rules, (zones, rows), strict=True) if needed)
 
 
-def _leaves_a_way(rows: Sequence[tuple[float, ...]], lanes: int) -> None:
-    """Raise ValueError where all lanes are closed at one place and time."""
-    for _, place, _, _, _ in rows:
-        for _, _, _, time, _ in rows:
-            shut = {k for k, a, b, since, until in rows if a <= place < b and since <= time < until}
-            if len(shut) >= lanes:
-                raise ValueError(
-                    f"closures: all {lanes} lanes are closed at {place:g} m at {max(time, 0.0):g} s. Leave one open."
-                )
+def _leaves_a_way(closed: Sequence[tuple[float, ...]], road: Lanes, time: float) -> None:
+    """Raise ValueError where nobody comes from the beginning of the road to an end of it, at a time (s).
+
+    Lane by lane and from place to place (m) where something changes: who is on lanes that go on, and may change to one.
+    """
+    table = {name: road.table(name) for name in WHERE}
+    begins, opens, closes, stops, leaves = table.values()
+    places = {x for column in (*table.values(), *(row[1:] for row in closed)) for x in column if x > 0.0}
+    reached = {k for k in range(road.count) if begins[k] <= 0.0}
+    for place in sorted({0.0, *places}):
+        if any(place >= leaves[k] for k in reached):
+            return
+        lanes = {k for k in range(road.count) if begins[k] <= place < stops[k]}
+        lanes -= {int(k) for k, begin, end in closed if begin <= place < end}
+        sideways = {k for k in lanes if opens[k] <= place < closes[k]}
+        reached &= lanes
+        for k in (*sorted(sideways), *sorted(sideways, reverse=True)):  # one way, and back
+            if {k - 1, k + 1} & reached & sideways:
+                reached.add(k)
+        if not reached:
+            raise ValueError(
+                f"closures: nobody gets past {place:g} m at {max(time, 0.0):g} s, where every lane that goes on is "
+                "closed. Leave one open."
+            )
 
 
 def lengths(kinds: Sequence[str], classes: Mapping[str, DriverClass], usual: float) -> list[float]:
@@ -139,7 +157,7 @@ def with_classes(
                 old = result.get(effect, {}).get(parameter)
                 if old is None:
                     raise ValueError(f"classes.{name}: parameter '{effect}.{parameter}' does not exist here.")
-                new = torch.full((len(kinds),), float(number), dtype=old.dtype, device=old.device)
+                new = torch.full((len(kinds),), number, dtype=old.dtype, device=old.device)
                 new = new * factors.get((effect, parameter), 1.0)
                 result[effect][parameter] = torch.where(mine.to(old.device), new, old)
     return result

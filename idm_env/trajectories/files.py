@@ -217,10 +217,7 @@ def _strand(strand: _Strand, progress: OnProgress) -> None:
         if parts.done(number):
             recent += chunks.restored(parts, number, tracks)
         else:
-            remarks = {
-                "left_out": pieces.left_out,
-                "notes": pieces.notes,
-            }
+            remarks = {"left_out": pieces.left_out, "notes": pieces.notes}
             recent += chunks.done(
                 parts, number, tracks, settings, strand.plan, recent, remarks,
                 lambda share, words, b=begin, e=end: progress(  # type: ignore[misc]
@@ -305,10 +302,7 @@ def _report(spool: Spool, parts: Sequence[dict[str, Any]], settings: FilterSetti
         "calibration_milliseconds_per_trajectory": 1e3 * totals["calibration_seconds"] / max(ours.tracks, 1),
         "overlapping_rows": int(totals["overlaps"]),
         "overlapping_rows_that_did_not_overlap_before": int(totals["new_overlaps"]),
-        "account": account(
-            ((r.kind, r.count) for r in spool.repairs),
-            [("tracks", len(lost))] if lost else [],
-        ),
+        "account": account(((r.kind, r.count) for r in spool.repairs), [("tracks", len(lost))] if lost else []),
         "versions": versions(),
     }
 

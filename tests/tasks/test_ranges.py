@@ -32,7 +32,7 @@ ODD: tuple[Any, ...] = (
     [1, 2, 3],
 )
 """What no option takes that is a number."""
-OWN = {"controlled", "max_command", "max_episode_steps"}
+OWN = {"controlled", "max_command"}
 """Options that are more than a number, and that say themselves what they take."""
 
 

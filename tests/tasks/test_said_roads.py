@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars
 import pytest
 import torch
@@ -15,6 +17,7 @@ from idm_env.multilane import demand
 from idm_env.tasks import Draw, Task, make_task
 from idm_env.tasks import trip_table as table
 from idm_env.tasks.open_roads import OpenHighwayTask
+from idm_env.tasks.said_roads import KEYS
 from idm_env.types import Command, Trips
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -110,13 +113,13 @@ BAD: dict[str, tuple[str, dict[str, Any]]] = {
     "lane = 0.5 of row 0": ("merge", {"trips": [{**ROW, "lane": 0.5}]}),
     "column 'departs' is unknown. Did you mean 'depart'": ("merge", {"trips": [{"departs": 1.0, "lane": 1}]}),
     "class 'bus' is unknown": ("merge", {"trips": [{**ROW, "class": "bus"}], "classes": TRUCK}),
-    "classes.truck = -0.1 must be a share": ("merge", {"classes": {"truck": {"share": -0.1}}}),
+    "classes.truck.share = -0.1 must be at least 0": ("merge", {"classes": {"truck": {"share": -0.1}}}),
     "shares of 1.2 in all": ("merge", {"classes": {"a": {"share": 0.7}, "b": {"share": 0.5}}}),
     "parameter 'idm.speed' does not exist": ("merge", {"classes": {"a": {"parameters": {"idm.speed": 3.0}}}}),
     "limits[0].speed = 0": ("merge", {"limits": [{"speed": 0.0}]}),
     "limits[0].lane = 3 does not exist": ("merge", {"limits": [{"speed": 20.0, "lane": 3}]}),
     "must end behind its beginning": ("merge", {"closures": [{"lane": 1, "begin": 300.0, "end": 200.0}]}),
-    "all 3 lanes are closed at 120 m at 30 s": (
+    "nobody gets past 120 m at 30 s": (
         "merge",
         {"closures": [{"lane": k, "begin": 100.0 + 10 * k, "end": 200.0, "since": 15.0 * k} for k in range(3)]},
     ),
@@ -126,6 +129,28 @@ BAD: dict[str, tuple[str, dict[str, Any]]] = {
     "is not CSV in UTF-8": ("merge", {"trips": str(ROOT / "docs" / "ring.gif")}),
     "keyword argument 'lanes'. Did you mean 'lanes_count'": ("approach", {"lanes": 3}),
     "lets nobody depart": ("merge", {"trips": {"per_hour": {1: 0}}}),
+    "trips: class 'bus' is unknown. Known: none.": ("merge", {"trips": [{**ROW, "class": "bus"}]}),
+    "nobody gets past 700 m at 0 s, where every lane that goes on is closed": (
+        "bottleneck", {"closures": [{"lane": 1, "begin": 700.0, "end": 750.0}]}),
+    "nobody gets past 300 m at 60 s": (
+        "merge", {"closures": [{"lane": k, "begin": 300.0, "end": 350.0, "since": 60.0} for k in (1, 2)]}),
+    "limits[0].begin = 5000 m must be at most 900": ("merge", {"limits": [{"speed": 20.0, "begin": 5000.0}]}),
+    "limits[0].end = 901 m must be at most 900": ("merge", {"limits": [{"speed": 20.0, "end": 901.0}]}),
+    "signal.red = 70 s must not exceed signal.cycle = 60 s": ("approach", {"parameters": {"signal": {"red": 70.0}}}),
+    "signal.red = 30 s must not exceed signal.cycle = 20 s": ("approach", {"parameters": {"signal.cycle": 20.0}}),
+    "signal.red = 50 s must not exceed signal.cycle = 40 s": (
+        "approach", {"randomise": {"signal.red": [20.0, 50.0], "signal.cycle": [40.0, 60.0]}}),
+    "signal.place must be 500 m": ("approach", {"parameters": {"signal.place": 300.0}}),
+    "trips.seconds = 1e+08 s lets 1.39e+07 vehicles depart, of at most 100000": (
+        "merge", {"trips": {"per_hour": {1: 500}, "seconds": 1e8}}),
+    "trips.seconds = 1e+12 s must be at most 1e+09": ("merge", {"trips": {"per_hour": {1: 500}, "seconds": 1e12}}),
+    "trips.per_hour of lane 1 is given twice": ("merge", {"trips": {"per_hour": {1: 500, "1": 600}}}),
+    "must rise in time": ("merge", {"trips": {"per_hour": {1: [[300, 500], [0, 900]]}}}),
+    "limits = {'speed': 20.0} must be a list": ("merge", {"limits": {"speed": 20.0}}),
+    "a name = '' must be a text": ("merge", {"classes": {"": {"share": 0.2}}}),
+    "inflow of lane 0 = 0": ("approach", {"inflow": 0.0}),
+    "off_ramp = [400.0, 400.0] must be [begin, end] (m)": ("open_highway", {"off_ramp": [400.0, 400.0]}),
+    "parameters = [] must be a mapping": ("merge", {"parameters": []}),
 }  # fmt: skip
 
 
@@ -152,6 +177,94 @@ def test_two_columns_of_one_name_are_refused(tmp_path: Path) -> None:
     (tmp_path / "trips.csv").write_text("depart,lane,lane\n1.0,0,1\n")
     with pytest.raises(ValueError, match=r"trips\.csv': column 'lane' is there twice\. Remove one\.$"):
         make_task("merge", trips=str(tmp_path / "trips.csv"))
+    frame = pytest.importorskip("pandas").DataFrame({"depart": [1.0], "lane": [1]})
+    with pytest.raises(ValueError, match=r"^trips: column 'lane' is there twice\. Remove one\.$"):
+        make_task("merge", trips=frame[["depart", "lane", "lane"]])
+
+
+ODD: tuple[Any, ...] = (
+    True, math.nan, -math.inf, "no", b"1", [], [1, 2], {"a": 1}, 10**400, -1e300, object(), 1 + 2j, "",
+    np.array([1.0, 2.0]), torch.tensor([1.0, 2.0]),
+)  # fmt: skip
+FITS = {"parameters": ([], {}), "name": ("no",), "class": (math.nan, "", None), "destination": (math.nan, "", None)}
+"""Of the odd values, those that a key takes."""
+WHOLE: dict[str, dict[str, Any]] = {
+    "classes": {"share": 0.2, "length": 12.0, "parameters": {"idm.time_gap": 1.5}},
+    "limits": {"lane": 1, "begin": 10.0, "end": 20.0, "speed": 20.0},
+    "closures": {"lane": 1, "begin": 10.0, "end": 20.0, "since": 5.0, "until": 9.0},
+    "detectors": {"lane": 1, "place": 10.0, "every": 5.0, "name": "one"},
+    "trips": {"depart": 5.0, "lane": 1, "speed": 20.0, "class": "", "destination": ""},
+    "trips of a demand": {"per_hour": {1: 500}, "seconds": 60.0, "seed": 1, "speed": 20.0, "classes": {},
+                          "destinations": {}},
+}  # fmt: skip
+
+
+def nested(name: str, value: Any) -> Task:
+    """Return a task with one value of a nested keyword."""
+    keyword = name.split(" ")[0]
+    if keyword == "classes":
+        return make_task("merge", classes={"truck": value})
+    return make_task("merge", **{keyword: value if "demand" in name or not isinstance(value, dict) else [value]})
+
+
+def test_every_key_of_a_nested_keyword_refuses_what_it_does_not_take_by_its_name() -> None:
+    """Whatever stands for a value, an entry or the whole; the keyword, one line, and no words of a library."""
+    wrong = []
+    for name, usual in WHOLE.items():
+        nested(name, usual)
+        assert "trips" in name or usual.keys() == KEYS[name].keys()
+        odd = [
+            (f"{name}.{key}", {**usual, key: value})
+            for key in usual
+            for value in ODD
+            if not any(value is x or (type(value) is type(x) and value == x) for x in FITS.get(key, ()))
+        ]
+        lists = name in ("limits", "closures", "detectors")  # of which an empty one is right
+        odd += [(name, value) for value in (*ODD, 1, 0.5) if not (lists and isinstance(value, list) and not value)]
+        odd += [(f"{name}: unknown", {**usual, key: 1}) for key in ("x", 3, ("a",))]
+        for case, value in odd:
+            try:
+                nested(name, value)
+                wrong.append((case, value, "accepted"))
+            except ValueError as error:
+                if "\n" in str(error) or not str(error).startswith(name.split(" ")[0]) or len(str(error)) > 400:
+                    wrong.append((case, value, error))
+            except Exception as error:
+                wrong.append((case, value, repr(error)))
+    assert not wrong, wrong[:20]
+
+
+def test_numbers_of_numpy_and_a_mark_before_a_file_are_right(tmp_path: Path) -> None:
+    """Python's own and NumPy's say the same; Excel writes a mark (BOM) before the first column."""
+    (tmp_path / "trips.csv").write_text("\ufeffdepart,lane,class\n5.0,1,truck\n", encoding="utf-8")
+    said = {
+        "classes": {"truck": {"share": np.float32(0.25), "length": np.int64(12)}},
+        "limits": [{"lane": np.int64(1), "speed": np.float32(20.0)}],
+        "closures": [{"lane": np.int32(2), "begin": np.int64(100), "end": np.float64(200.0)}],
+        "detectors": [{"lane": np.int8(1), "place": np.float32(100.0)}],
+        "controlled": np.int64(1), "max_episode_steps": np.int64(50),
+    }  # fmt: skip
+    for trips in (
+        str(tmp_path / "trips.csv"),
+        {"per_hour": {np.int64(1): np.float32(900.0)}, "seconds": np.int64(50), "seed": np.int32(3)},
+        [{"depart": np.float32(1.0), "lane": np.int64(1), "class": None}],
+    ):
+        task = make_task("merge", trips=trips, **said)
+        assert task.rules[0].zones[0][:1] == (1.0,) and task.loops[0].lane == 1 and task.horizon == 50
+    assert task.kinds == ("",) and make_task("merge", trips=str(tmp_path / "trips.csv"), **said).kinds == ("truck",)
+
+
+def test_a_road_of_which_one_way_is_left_is_made() -> None:
+    """Lanes one after the other, the ramp, a lane for a time: traffic finds its way round."""
+    between = [{"lane": 1, "begin": 100.0, "end": 200.0}, {"lane": 2, "begin": 250.0, "end": 300.0}]
+    for task, closures in (
+        ("merge", between),
+        ("merge", [{"lane": 0, "begin": 200.0, "end": 300.0}]),
+        ("bottleneck", [{"lane": k, "begin": 200.0, "end": 300.0} for k in (0, 2, 3)]),
+        ("merge", [{"lane": k, "begin": 100.0, "end": 200.0, "since": 60.0 * k, "until": 60.0 * k + 60.0}
+                   for k in (1, 2)]),
+    ):  # fmt: skip
+        make_task(task, closures=closures)
 
 
 @pytest.mark.parametrize("says", BAD)
