@@ -74,22 +74,13 @@ def settings(
         KeywordError: A TypeError in one line, with a suggestion, for a keyword that does not exist.
         ValueError: In one line, with a suggestion, for a value that cannot be.
     """
-    own = {
-        "task": task,
-        "output": output,
-        "device": device,
-        "dtype": dtype,
-        "autoreset_mode": autoreset_mode,
-        "render_mode": render_mode,
-        "max_episode_steps": max_episode_steps,
-        "info": info,
-    }
+    own = {name: value for name, value in locals().items() if name not in ("config", "trusted", "choices")}
     if config is not None:
         read = load_environment(config, trusted=trusted)
         in_file = {key: read.pop(key, None) for key in own}
         own = {key: in_file[key] if value is None else value for key, value in own.items()}
         choices = {**read, **choices}
-    chosen = own["task"] or "ring"
+    chosen = "ring" if own["task"] is None else own["task"]
     if own["max_episode_steps"] is not None:
         choices["max_episode_steps"] = own["max_episode_steps"]
     if isinstance(chosen, Task) and choices:
@@ -99,12 +90,14 @@ def settings(
         )
     with trust.trusting(trusted):
         own_task = chosen if isinstance(chosen, Task) else task_with(cast(str, chosen), choices, KEYWORDS)
+    usual = {"output": "numpy", "device": "cpu", "dtype": "float32", "autoreset_mode": AutoresetMode.SAME_STEP}
+    own |= {name: value for name, value in usual.items() if own[name] is None}
     result = Settings(
         task=own_task,
-        output=cast(Any, one_of("output", own["output"] or "numpy", OUTPUTS)),
-        device=_device(own["device"] or "cpu"),
-        dtype=DTYPES[one_of("dtype", own["dtype"] or "float32", DTYPES)],
-        autoreset_mode=_mode(own["autoreset_mode"] or AutoresetMode.SAME_STEP),
+        output=cast(Any, one_of("output", own["output"], OUTPUTS)),
+        device=_device(own["device"]),
+        dtype=DTYPES[one_of("dtype", own["dtype"], DTYPES)],
+        autoreset_mode=_mode(own["autoreset_mode"]),
         render_mode=None if own["render_mode"] is None else one_of("render_mode", own["render_mode"], RENDER_MODES),
         limit=own_task.horizon,
         info=_info(own["info"]),

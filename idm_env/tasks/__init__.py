@@ -8,7 +8,7 @@ from typing import Any
 
 from idm_env.jobs import trust
 from idm_env.tasks.approach import ApproachTask
-from idm_env.tasks.base import Bounds, Ended, EnvState, Features, RewardRange, Task
+from idm_env.tasks.base import EnvState, Task
 from idm_env.tasks.checks import KeywordError
 from idm_env.tasks.features import FEATURES, AgentView, Feature
 from idm_env.tasks.follow import FollowTask
@@ -72,12 +72,9 @@ __all__ = [
     "AgentView",
     "ApproachTask",
     "BottleneckTask",
-    "Bounds",
     "Draw",
-    "Ended",
     "EnvState",
     "Feature",
-    "Features",
     "FollowTask",
     "HighwayTask",
     "KeywordError",
@@ -86,7 +83,6 @@ __all__ = [
     "PlatoonTask",
     "ReplayLanesTask",
     "ReplayTask",
-    "RewardRange",
     "RewardTerm",
     "RingTask",
     "Task",

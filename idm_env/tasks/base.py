@@ -355,11 +355,10 @@ class Task(abc.ABC):
     @cached_property
     def _ranges(self) -> dict[tuple[str, str], tuple[float, float]]:
         """What is drawn for every episode, and the ends of its range."""
-        spans = ranges_of(
-            {k: v for k, v in self.randomise.items() if k not in self.can_draw}
-            if isinstance(self.randomise, Mapping)
-            else self.randomise
-        )
+        drivers = self.randomise
+        if isinstance(drivers, Mapping):
+            drivers = {name: value for name, value in drivers.items() if name not in self.can_draw}
+        spans = ranges_of(drivers)
         below = {full for full, p in catalogue(self._behaviour.effects).items() if p.most}
         for end in ("lowest", "highest", "nearest") if spans else ():  # the last: what another bounds, against it
             values = {effect: dict(part) for effect, part in self._behaviour.parameters.items()}

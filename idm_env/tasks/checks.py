@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 from idm_env.model_file import nested
@@ -82,8 +83,7 @@ def entries(where: str, given: Any, keys: Mapping[str, Key]) -> list[tuple[str, 
     """Return the name and the values of every entry of a list, as ``entry`` does. ValueError for no list of such."""
     if not isinstance(given, Sequence) or isinstance(given, str | bytes):
         raise ValueError(f"{where} = {shown(given)} must be a list of mappings of {_listed(keys)}.")
-    names = [f"{where}[{i}]" for i in range(len(given))]
-    return [(name, entry(name, one, keys)) for name, one in zip(names, given, strict=True)]
+    return [(f"{where}[{i}]", entry(f"{where}[{i}]", one, keys)) for i, one in enumerate(given)]
 
 
 def text(where: str, value: Any) -> str:
@@ -148,11 +148,8 @@ def span(name: str, value: Any, low: float, unit: str, high: float = math.inf) -
 
 def ranges_of(randomise: Mapping[str, Any] | None) -> dict[tuple[str, str], tuple[float, float]]:
     """Return what episodes draw parameters from, by effect and name. ValueError for what is no range."""
-    spans = {}
-    for effect, part in nested({} if randomise is None else randomise, "randomise").items():
-        for name, value in part.items():
-            spans[effect, name] = two_ends(f"randomise.{effect}.{name}", value)
-    return spans
+    parts = nested({} if randomise is None else randomise, "randomise").items()
+    return {(e, name): two_ends(f"randomise.{e}.{name}", x) for e, part in parts for name, x in part.items()}
 
 
 def two_ends(name: str, value: Any) -> tuple[float, float]:
@@ -172,8 +169,7 @@ def limits_of(max_command: Any) -> tuple[float, float]:
         if len(ends) != 2 or not (-_STRONGEST <= ends[0] <= -_WEAKEST and _WEAKEST <= ends[1] <= _STRONGEST):
             raise ValueError(
                 f"max_command = {shown(list(max_command))} must be one number, or [hardest braking, strongest "
-                f"acceleration] with a braking below 0 and an acceleration above 0, such as [-4.5, 2.6] (m/s²), none "
-                f"beyond {_STRONGEST:g}."
+                f"acceleration] (m/s²), such as [-4.5, 2.6], none beyond {_STRONGEST:g}."
             )
         return ends[0], ends[1]
     top = at_least("max_command", max_command, _WEAKEST, "m/s²", _STRONGEST)
@@ -185,15 +181,13 @@ def count_of(controlled: Any, free: int) -> int:
 
     ValueError for anything else.
     """
-    if controlled == "all":
+    if isinstance(controlled, str) and controlled == "all":
         return max(1, free)
-    if isinstance(controlled, float):
-        if not 0.0 < controlled <= 1.0:
-            raise ValueError(f"controlled = {controlled} must be a fraction above 0 and up to 1, a number, or 'all'.")
-        return max(1, round(controlled * free))
-    if isinstance(controlled, str):
-        raise ValueError(f"controlled = {shown(controlled)} must be 'all', a number, a fraction or a list of vehicles.")
-    return whole("controlled", controlled, 1)
+    if isinstance(controlled, Integral):
+        return whole("controlled", controlled, 1)
+    if not isinstance(controlled, Real) or not 0.0 < float(controlled) <= 1.0:
+        raise ValueError(f"controlled = {shown(controlled)} must be 'all', a number, a fraction up to 1 or a list.")
+    return max(1, round(float(controlled) * free))
 
 
 def agents_of(controlled: Any, vehicles: int, first: int) -> tuple[int, ...]:

@@ -12,18 +12,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import (
-    IDM,
-    Brakes,
-    Calm,
-    Control,
-    Courtesy,
-    Effect,
-    GapAcceptance,
-    LaneClosure,
-    MandatoryChange,
-    Mobil,
-)
+from idm_env import effects as laws
 from idm_env.metrics import CO2, fuel
 from idm_env.multilane import demand
 from idm_env.roads import Lanes
@@ -126,8 +115,9 @@ class OpenLanesTask(LanesTask):
             and a name of its place where it has none). An environment's ``detectors`` are rows of what each tells.
     """
 
-    own_effects: ClassVar[tuple[Effect, ...]] = (
-        IDM(), Calm(), Mobil(), MandatoryChange(), GapAcceptance(), Courtesy(), Brakes(),
+    own_effects: ClassVar[tuple[laws.Effect, ...]] = (
+        laws.IDM(), laws.Calm(), laws.Mobil(), laws.MandatoryChange(), laws.GapAcceptance(), laws.Courtesy(),
+        laws.Brakes(),
     )  # fmt: skip
     own_parameters: ClassVar = {
         "idm": {"max_accel": 1.5, "comfort_decel": 2.0, "time_gap": 1.2, "min_gap": 2.0, "desired_speed": 30.0},
@@ -244,7 +234,7 @@ class OpenLanesTask(LanesTask):
         return self.table.kind
 
     @cached_property
-    def rules(self) -> tuple[Effect, ...]:
+    def rules(self) -> tuple[laws.Effect, ...]:
         """What the road tells its drivers."""
         return rules_of(self.limits, self.closed, self.road)
 
@@ -285,9 +275,9 @@ class OpenLanesTask(LanesTask):
         return round(600.0 / self._behaviour.dt)
 
     @property
-    def machinery(self) -> tuple[Effect, ...]:  # type: ignore[override]
+    def machinery(self) -> tuple[laws.Effect, ...]:  # type: ignore[override]
         """Effects through which agents act."""
-        return (Control(careful=self.careful, added=self.added), *super().machinery[1:], *self.rules)
+        return (laws.Control(careful=self.careful, added=self.added), *super().machinery[1:], *self.rules)
 
     @cached_property
     def _slots(self) -> tuple[tuple[float, float], ...]:
@@ -365,7 +355,7 @@ class OpenLanesTask(LanesTask):
     def _open_until(self, lane: Tensor, like: Tensor) -> Tensor:
         """Return up to where one can drive on a lane when an episode begins (m)."""
         ends = self.road.closed_at(lane, like)
-        rows = (row for rule in self.rules if isinstance(rule, LaneClosure) for row in rule.closures)
+        rows = (row for rule in self.rules if isinstance(rule, laws.LaneClosure) for row in rule.closures)
         for k, begin, _, since, until in rows:
             if since <= 0.0 < until:
                 ends = torch.where(lane == int(k), ends.clamp_max(begin), ends)

@@ -130,10 +130,7 @@ def _leaves_a_way(closed: Sequence[tuple[float, ...]], road: Lanes, time: float)
             if {k - 1, k + 1} & reached & sideways:
                 reached.add(k)
         if not reached:
-            raise ValueError(
-                f"closures: nobody gets past {place:g} m at {max(time, 0.0):g} s, where every lane that goes on is "
-                "closed. Leave one open."
-            )
+            raise ValueError(f"closures: nobody gets past {place:g} m at {max(time, 0.0):g} s. Leave a way on.")
 
 
 def lengths(kinds: Sequence[str], classes: Mapping[str, DriverClass], usual: float) -> list[float]:

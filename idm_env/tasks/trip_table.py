@@ -126,13 +126,10 @@ def flows(where: str, given: Any) -> dict[int, list[tuple[float, float]]]:
 
 
 KEYS: Mapping[str, Key] = {
-    "per_hour": Key(flows),
-    "seconds": Key(Range(0.0, 1e9, "s"), 600.0),
-    "seed": Key(Range(0, 2**63 - 1, whole=True), 0),
-    "speed": Key(Range(1.0, 100.0, "m/s"), ENTRY_SPEED),
-    "classes": Key(by_name, None),
+    "per_hour": Key(flows), "seconds": Key(Range(0.0, 1e9, "s"), 600.0), "seed": Key(Range(0, 1e18, whole=True), 0),
+    "speed": Key(Range(1.0, 100.0, "m/s"), ENTRY_SPEED), "classes": Key(by_name, None),
     "destinations": Key(by_name, None),
-}
+}  # fmt: skip
 """What ``trips`` takes in place of a table: the arguments of ``table``."""
 
 

@@ -130,7 +130,7 @@ BAD: dict[str, tuple[str, dict[str, Any]]] = {
     "keyword argument 'lanes'. Did you mean 'lanes_count'": ("approach", {"lanes": 3}),
     "lets nobody depart": ("merge", {"trips": {"per_hour": {1: 0}}}),
     "trips: class 'bus' is unknown. Known: none.": ("merge", {"trips": [{**ROW, "class": "bus"}]}),
-    "nobody gets past 700 m at 0 s, where every lane that goes on is closed": (
+    "nobody gets past 700 m at 0 s. Leave a way on.": (
         "bottleneck", {"closures": [{"lane": 1, "begin": 700.0, "end": 750.0}]}),
     "nobody gets past 300 m at 60 s": (
         "merge", {"closures": [{"lane": k, "begin": 300.0, "end": 350.0, "since": 60.0} for k in (1, 2)]}),
