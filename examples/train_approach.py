@@ -30,7 +30,6 @@ def returns(advice, seeds):
         autoreset_mode="Disabled",
         observation="raw",
         **ROAD,
-        info=["co2", "outflow"],
     )
     seen, paid, burnt = env.reset(seed=[*seeds] * (count // len(seeds)))[0], np.zeros(count), np.zeros(count)
     names, red = env.unwrapped.task.bounds.names, env.unwrapped.task.cycle - env.unwrapped.task.green

@@ -19,7 +19,7 @@ chosen = {
     "observation": SEEN,
     "info": "none",
 }
-env = gymnasium.make_vec("idm_env:DiffIDM-v0", num_envs=rows, autoreset_mode="Disabled", info="none", **chosen)
+env = gymnasium.make_vec("idm_env:DiffIDM-v0", num_envs=rows, autoreset_mode="Disabled", **chosen)
 
 
 def returns(shares, first):

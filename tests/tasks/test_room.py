@@ -70,7 +70,7 @@ def test_drivers_who_collide_in_the_warm_up_begin_without_it(tmp_path: Path) -> 
     draw = Draw.of(torch.arange(12), torch.zeros(12, dtype=torch.int64))
     task, without = make_task("ring", **given), make_task("ring", **given, warmup=0)
     params = task.params(torch.float64, "cpu")
-    with pytest.warns(UserWarning, match=r"ran into each other in its warm-up of 750 steps: .* or warmup=0"):
+    with pytest.warns(UserWarning, match=r"ran into each other in its warm-up of 1500 steps: .* or warmup=0"):
         world = task.reset(draw, params)
     plain = without.reset(draw, params)
     assert bool((world.state.gap > 0).all()) and bool((world.state.step == 0).all())
