@@ -53,19 +53,6 @@ MOST_BYTES, DEEPEST, LONGEST = 20_000_000, 20, 500
 Numbers = dict[str, dict[str, float]]
 """Effect name → parameter name → number."""
 
-_MODEL_KEYS = (
-    "configures",
-    "schema",
-    "dt",
-    "integration",
-    "effects",
-    "parameters",
-    "by",
-    "drivers",
-    "substeps",
-    "fitted_on",
-)
-
 
 @dataclass(frozen=True)
 class Model:
@@ -135,7 +122,7 @@ def load_model(path: str | Path, *, trusted: bool = False) -> Model:
 
 
 def _model(content: dict[str, Any]) -> Model:
-    _check_keys(content, _MODEL_KEYS, "key")
+    _check_keys(content, ("configures", "schema", *(field.name for field in dataclasses.fields(Model))), "key")
     if content.get("configures", "model") != "model":
         raise ValueError(
             f"configures = {shown(content['configures'])}, and a model is wanted. Write 'configures: model'."

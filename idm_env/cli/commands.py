@@ -29,7 +29,25 @@ class _Refusing(typer.core.TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         refusals.refuse(ctx.params)
+        for name in options.FILES:
+            if isinstance(ctx.params.get(name), list) and not ctx.params.get("each"):
+                _join(ctx.params, name)
         return super().invoke(ctx)
+
+
+def _join(params: dict[str, Any], name: str) -> None:
+    """Replace several files among a command's parameters by the path of one, with tidy columns in SI units."""
+    paths, folders = params[name], "recipe" in params or "held_out" in params  # filter, reconstruct and fit take them
+    if len(paths) > 1 or paths[0].is_dir() or not paths[0].exists():
+        from idm_env.data.joined import joined
+
+        layout, columns = params.get("layout", "auto"), params.get("columns")
+        out = params["out"].resolve()
+        if (out / storage.MARK).exists() and (old := next((p for p in paths if p.resolve().parent == out), None)):
+            raise ValueError(f"{old} lies in --out, whose results are replaced. Give --out another folder.")
+        params[name] = [joined(paths, layout=layout, columns=columns, whole=not folders)]
+        if params[name][0] not in paths:
+            params |= {key: value for key, value in (("layout", "auto"), ("columns", None)) if key in params}
 
 
 app = typer.Typer(
@@ -209,7 +227,7 @@ def filter_(*, data: Path, job: options.JobOptions, tracks: options.TrackOptions
     """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters.
 
     Args:
-        data: Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.
+        data: Trajectories: csv, parquet and others; several files or a folder: each is a run, but of parquet files.
     """
     with shown(console) as report:
         from idm_env.trajectories.files import filter_file
@@ -233,7 +251,7 @@ def reconstruct(
     """Reconstruct dense trajectories from sparse ones, a second or more between points.
 
     Args:
-        data: Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.
+        data: Trajectories: csv, parquet and others; several files or a folder: each is a run, but of parquet files.
         dt: Step of the dense trajectories (s).
     """
     with shown(console) as report:
@@ -278,7 +296,7 @@ def fit(
     and judged on drivers held out; hypothetical accelerations are those of --model or --base.
 
     Args:
-        data: Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.
+        data: Trajectories: csv, parquet and others; several files or a folder: each is a run, but of parquet files.
         by: driver, all, or a column such as vehicle_name.
         held_out: "column=value", or a share of the runs such as 0.25.
         objective: spacing, speed or both.
@@ -371,7 +389,7 @@ def _fit_lane_changes(
 @app.command()
 def explain(
     *,
-    data: list[Path],
+    data: Path | list[Path],
     job: options.JobOptions,
     by: str = "driver",
     effects: str | None = None,
@@ -380,6 +398,7 @@ def explain(
     seed: options.Seed = 0,
     file: options.FileOptions,
     split_runs: str | None = None,
+    each: bool = False,
 ) -> None:
     """Find the effect that a calibrated car-following model lacks, add it, and report the errors before and after.
 
@@ -387,11 +406,11 @@ def explain(
     neither for fitting nor for model selection.
 
     Args:
-        data: Trajectories: csv, csv.gz, parquet. Several data sets: files, a folder, 'drives/*.csv'.
         by: Who shares IDM parameters: driver, all, or a column.
         effects: Candidates, by comma: names, or my_file.py:MyEffect; default: the whole catalogue.
         known: Effects whose values are in the file, such as grade.
         split_runs: Cut recordings into runs of so many seconds, 60s; each driver counts in one of them.
+        each: Several files are several data sets, explained one by one: a report each, and a table.
     """
     out = job.out
     with shown(console) as report:
@@ -399,7 +418,8 @@ def explain(
         from idm_env.data.load import files_of
         from idm_env.reports import undecided
 
-        files, seconds = files_of(data), pieces.seconds_of(split_runs)
+        files = files_of(data if isinstance(data, list) else [data])
+        seconds = pieces.seconds_of(split_runs)
         candidates, inputs = _names("--effects", effects), _names("--known", known) or ()
         read = None
         if len(files) == 1:  # what one recording cannot tell is said before anything slow is imported

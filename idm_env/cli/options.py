@@ -23,6 +23,8 @@ with needed("the command line"):
 
 OUT = Path("out")
 """Folder of results where none is named: a command has its own in it."""
+FILES = ("data", "source")
+"""Files of traffic: one, or several that are one data set, which a command gets as one path."""
 POSITIONAL = "positional"
 """Marks an option that is written without its name, and may be left out."""
 
@@ -45,7 +47,7 @@ class SharedOptions:
     """Options of several commands: what a command or a group of options does not describe itself means this.
 
     Args:
-        data: Trajectories: csv, csv.gz or parquet; tidy, NGSIM or OpenACC layout.
+        data: Trajectories: csv, parquet and others; several files, a folder, 'drives/*.csv': each file is a run.
         out: Folder for the results; made if missing.
         seed: Seed of everything random.
         model: A model.yaml of explain: its effects stay, IDM is fitted.
@@ -165,6 +167,7 @@ def _for_typer(name: str, kind: Any, default: Any, meaning: str) -> Any:
     base, *marks = get_args(kind) if get_origin(kind) is Annotated else (kind,)
     if base is typer.Context:
         return base
+    base = list[Path] if name in FILES and default is inspect.Parameter.empty else base
     base = str if get_origin(base) is Literal else base  # the words are checked, and named, in ``refusals``
     if default is inspect.Parameter.empty or POSITIONAL in marks:
         return Annotated[base, typer.Argument(help=meaning)]
@@ -195,6 +198,7 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def spreading(**values: Any) -> None:
+        values |= {name: values[name][0] for name in FILES if len(values.get(name) or ()) == 1}
         command(**{name: _gathered(kind, values) for name, kind in groups.items()}, **values)
 
     spreading.__doc__ = inspect.cleandoc(command.__doc__ or "").partition("\nArgs:\n")[0]

@@ -33,23 +33,23 @@ def refuse(given: Mapping[str, Any]) -> None:
     if given.get("scenarios"):
         _scenarios([Path(path) for path in given["scenarios"]])
     data = given.get("data", given.get("source"))
-    if data is None or str(data).endswith((".yaml", ".yml")):
+    if data is None or str(data[0] if isinstance(data, (list, tuple)) else data).endswith((".yaml", ".yml")):
         return
     from idm_env.data import folder
     from idm_env.data.load import LAYOUTS, files_of, refuse_head
 
     layout = one_of("--layout", given.get("layout", "auto"), LAYOUTS)
-    if isinstance(data, (list, tuple)):
-        files = files_of([Path(path) for path in data])
-    elif Path(data).is_dir() and ("recipe" in given or "held_out" in given):  # filter, reconstruct and fit take folders
-        files = [Path(name) for name in folder.files_of(Path(data))]
+    paths = [Path(path) for path in (data if isinstance(data, (list, tuple)) else [data])]
+    if len(paths) == 1 and paths[0].is_dir() and any(paths[0].rglob("*.parquet")):
+        files = [Path(name) for name in folder.files_of(paths[0])]
+        files = files if len(files) == 1 else []  # columns may be in the names of folders
     else:
-        files = [Path(data)]
+        files = files_of(paths)
     by, held = given.get("by"), str(given.get("held_out") or "")
     names = [*(given.get("where") or ()), *([held] if "=" in held else [])]
-    if len(files) == 1:  # of several, those that cannot be used are left out
-        group = None if by in ("driver", "all") else by
-        refuse_head(files[0], layout, names, given.get("place"), group, given.get("columns"))
+    group = None if by in ("driver", "all") else by
+    for file in [] if given.get("each") else files:  # with --each those that cannot be used are left out
+        refuse_head(file, layout, names, given.get("place"), group, given.get("columns"))
 
 
 def _scenarios(paths: list[Path]) -> None:

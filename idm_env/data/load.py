@@ -25,6 +25,8 @@ BATCH_BYTES, BATCH_ROWS = 16_000_000, 200_000
 """Text and rows that ``batches`` holds at a time."""
 HEAD_ROWS = 100
 """Rows that ``refuse_head`` reads."""
+REPAIRS: dict[Path, tuple[Repair, ...]] = {}
+"""Repairs of files that were joined, by their copy."""
 _MISSING = ["", "NA", "N/A", "NaN", "nan", "null", "None"]
 _UNREADABLE = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, EOFError, UnicodeError, ValueError)
 
@@ -126,7 +128,8 @@ def read(
             above = openacc.HEADER_LINES if above is None else above
             table = _once(_table(path, extension, written, above, rows), path.name)
             return openacc.read(table, lines[:above], path.name.split(".")[0], path.name)
-        return _plain_layout(_table(path, extension, written, 0, rows), layout, path.name, columns)
+        frame, repairs = _plain_layout(_table(path, extension, written, 0, rows), layout, path.name, columns)
+        return frame, [*REPAIRS.get(path, ()), *repairs]
     except pl.exceptions.PolarsError as error:
         raise _unreadable(path, error) from error
 
@@ -161,7 +164,8 @@ def batches(
             if number == 0 and columns is None and (explain_each_other or drones.layout_of(table.columns)):
                 yield read(path, layout=layout)
                 return
-            yield _plain_layout(table, layout, path.name, columns)
+            frame, repairs = _plain_layout(table, layout, path.name, columns)
+            yield frame, [*(() if number else REPAIRS.get(path, ())), *repairs]
     except pl.exceptions.PolarsError as error:
         raise _unreadable(path, error) from error
 

@@ -16,17 +16,8 @@ FOOT_M = 0.3048
 FRAME_S = 0.1
 NEW_VEHICLE_MS = 60_000
 """A vehicle that is away for longer than this is another one with the same identifier."""
-_NUMBERS = (
-    "vehicle_id",
-    "frame_id",
-    "total_frames",
-    "global_time",
-    "local_x",
-    "local_y",
-    "v_length",
-    "v_vel",
-    "lane_id",
-)
+_WHOLE = ("vehicle_id", "frame_id", "global_time", "total_frames", "lane_id", "preceding")
+_NUMBERS = (*_WHOLE, "local_x", "local_y", "v_length", "v_vel")
 _ALIASES = (
     "v_length=veh_len v_length=v_len v_length=veh_length v_vel=veh_velocity v_vel=veh_vel v_vel=v_velocity "
     "v_acc=vehicle_acc v_class=veh_class total_frames=tot_frames global_time=epoch_ms preceding=preceding_veh "
@@ -61,7 +52,7 @@ def read(frame: pl.DataFrame, source: str = "table") -> tuple[pl.DataFrame, list
     for name in ("vehicle_id", "local_y"):
         if name not in frame.columns:
             raise missing_column(name, frame.columns, source)
-    names = [name for name in (*_NUMBERS, "preceding") if name in frame.columns]
+    names = [name for name in _NUMBERS if name in frame.columns]
     frame = frame.with_columns(_number(frame, name, source) for name in names)
     run = (
         pl.col("location").cast(pl.String).str.strip_chars().fill_null("ngsim") if "location" in frame.columns else None
@@ -87,7 +78,7 @@ def _plain(name: str) -> str:
 
 def _number(frame: pl.DataFrame, name: str, source: str) -> pl.Expr:
     column = pl.col(name)
-    whole = name in ("vehicle_id", "frame_id", "global_time", "total_frames", "lane_id", "preceding")
+    whole = name in _WHOLE
     if whole and frame[name].dtype.is_integer():
         return column.cast(pl.Int64, strict=False)
     if frame[name].dtype == pl.String:

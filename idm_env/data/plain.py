@@ -46,12 +46,17 @@ def plain(path: Path) -> Path:
             text = _rewritten(path, files)
         if text is None:
             return path
-        folder = tempfile.mkdtemp()
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        copy = Path(folder) / (path.name if path.name.lower().endswith(".csv") else f"{path.name}.csv")
+        copy = temporary() / (path.name if path.name.lower().endswith(".csv") else f"{path.name}.csv")
         copy.write_text(text, encoding="utf-8")
         _copies[key] = copy
     return _copies[key]
+
+
+def temporary() -> Path:
+    """Return a new folder that lasts as long as the process."""
+    folder = tempfile.mkdtemp()
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
 
 
 def _rewritten(path: Path, files: ExitStack) -> str | None:

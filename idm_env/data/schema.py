@@ -14,19 +14,8 @@ import polars as pl
 from idm_env.data.errors import DataError, Repair, repaired
 
 REQUIRED = ("vehicle_id", "time_s", "position_m")
-TIDY = (
-    "run_id",
-    "vehicle_id",
-    "leader_id",
-    "lane",
-    "time_s",
-    "position_m",
-    "speed_mps",
-    "accel_mps2",
-    "length_m",
-    "gap_m",
-)
 NUMBERS = ("time_s", "position_m", "speed_mps", "accel_mps2", "length_m", "gap_m", "ring_length_m")
+TIDY = ("run_id", "vehicle_id", "leader_id", "lane", *NUMBERS[:-1])
 TRACK = ["run_id", "vehicle_id"]
 
 LARGEST = {"time_s": 1e13, "position_m": 1e7, "speed_mps": 1e4, "gap_m": 1e6, "length_m": 1e4, "ring_length_m": 1e7}

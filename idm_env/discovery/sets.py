@@ -11,6 +11,7 @@ from typing import Any
 import polars as pl
 
 from idm_env.data import Trajectories
+from idm_env.data.joined import names_of
 from idm_env.data.pieces import cure, recordings
 from idm_env.discovery.discover import discover
 from idm_env.discovery.write import write_report
@@ -101,7 +102,7 @@ def explain_sets(
     A file that cannot be used has its reason in its row; the others are done. No result depends on ``executor``.
     """
     progress, out = on_progress or silent, out.absolute()
-    names = _names(paths)
+    names = names_of(paths)
     with storage.results(out, SETS, paths):
         stamps = [(p, p.stat().st_size, p.stat().st_mtime_ns) if p.exists() else p for p in paths]
         parts = Parts(out / storage.UNFINISHED / "sets", storage.fingerprint(question, stamps), resume)
@@ -133,16 +134,6 @@ def _explain_set(one: _Set, on_progress: OnProgress) -> None:
         "effects": " ".join(finding["effect"] or finding["label"] for finding in report["found"]),
         "gap_rmse_before_m": before and before["gap_rmse_m"], "gap_rmse_after_m": after and after["gap_rmse_m"],
     })  # fmt: skip
-
-
-def _names(paths: Sequence[Path]) -> list[str]:
-    """Return a folder's name for every file: its own without extension, numbered where that is there twice."""
-    names: list[str] = []
-    for path in paths:
-        name = path.name.split(".")[0]
-        count = sum(n == name or n.startswith(f"{name}-") for n in names)
-        names.append(f"{name}-{count + 1}" if count else name)
-    return names
 
 
 def _page(rows: Sequence[dict[str, Any]]) -> list[page.Block]:

@@ -19,17 +19,8 @@ GROUPS = tuple(f"model_group_{number}.yaml" for number in range(1, 9))
 """Laws of several kinds of drivers."""
 SEARCH = ("search.json", "model_search.yaml")
 """What a search saw whose judgement failed, and the model that it had come to."""
-EXPLAINED = (
-    "report.json",
-    "report.html",
-    "model.yaml",
-    "model_idm.yaml",
-    "model_law.yaml",
-    "model_corrected.yaml",
-    *GROUPS,
-    FOUND,
-    *SEARCH,
-)
+_MODELS = ("model.yaml", "model_idm.yaml", "model_law.yaml", "model_corrected.yaml")
+EXPLAINED = ("report.json", "report.html", *_MODELS, *GROUPS, FOUND, *SEARCH)
 """What ``explain`` writes."""
 
 

@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -54,6 +54,8 @@ def filter_file(
     path: str | Path,
     out: str | Path,
     *,
+    task: Literal["filter", "reconstruct"] = "filter",
+    dt: float | None = None,
     recipe: Recipe = "default",
     fixed_parameters: bool = False,
     baselines: bool = True,
@@ -74,61 +76,29 @@ def filter_file(
     ``model`` is a model.yaml, such as explain writes, whose effects the calibration keeps.
     Tracks that cannot be used are left out and counted. ``resume`` goes on after the last finished chunk. ``path`` may
     be a folder of parquet files. Runs are done by ``executor`` (None: here), on which no trajectory depends.
+    ``task`` and ``dt`` (s; None: of the data) are those of ``reconstruct_file``.
 
     Raises:
         DataError: If the file as a whole cannot be used, or ``resume`` finds a run with other data or settings.
     """
-    settings = FilterSettings("filter", None, recipe, fixed_parameters, baselines, chunk, model)
-    how = Reading(layout, columns, ring_length)
-    return run(path, out, settings, how, resume=resume, executor=executor, on_progress=on_progress)
+    if recipe not in OURS:
+        raise DataError(f"recipe = {recipe!r} is unknown; use 'default' or 'paper'.")
+    settings = FilterSettings(task, dt, recipe, fixed_parameters, baselines, chunk, model)
+    how, progress = Reading(layout, columns, ring_length), on_progress or silent
+    progress("compiling", 0, 0, "the loops")
+    _compile()
+    with storage.results(out, OUTPUT, (path, model)) as folder:
+        return _run(Path(path), folder.absolute(), settings, how, resume, executor or Serial(), progress)
 
 
-def reconstruct_file(
-    path: str | Path,
-    out: str | Path,
-    *,
-    dt: float = 0.1,
-    recipe: Recipe = "default",
-    fixed_parameters: bool = False,
-    baselines: bool = True,
-    model: str | None = None,
-    layout: str = "auto",
-    columns: Columns = None,
-    ring_length: float | None = None,
-    chunk: int = CHUNK,
-    resume: bool = False,
-    executor: Executor | None = None,
-    on_progress: OnProgress | None = None,
-) -> dict[str, Any]:
+def reconstruct_file(path: str | Path, out: str | Path, *, dt: float = 0.1, **options: Any) -> dict[str, Any]:
     """Reconstruct dense tracks of step ``dt`` (s) from sparse ones; holes are bridged. Else as ``filter_file``.
 
     The published recipe keeps its own step of 1 s. DataError for a step outside [0.01, 2] s.
     """
     if not 0.01 <= dt <= 2.0:
         raise DataError(f"dt = {dt:g} s is outside [0.01, 2] s; 0.1 s suits vehicles.")
-    settings = FilterSettings("reconstruct", dt, recipe, fixed_parameters, baselines, chunk, model)
-    how = Reading(layout, columns, ring_length)
-    return run(path, out, settings, how, resume=resume, executor=executor, on_progress=on_progress)
-
-
-def run(
-    path: str | Path,
-    out: str | Path,
-    settings: FilterSettings,
-    how: Reading,
-    *,
-    resume: bool = False,
-    executor: Executor | None = None,
-    on_progress: OnProgress | None = None,
-) -> dict[str, Any]:
-    """Do what ``filter_file`` and ``reconstruct_file`` say. DataError for an unknown recipe."""
-    if settings.recipe not in OURS:
-        raise DataError(f"recipe = {settings.recipe!r} is unknown; use 'default' or 'paper'.")
-    progress = on_progress or silent
-    progress("compiling", 0, 0, "the loops")
-    _compile()
-    with storage.results(out, OUTPUT, (path, settings.model)) as folder:
-        return _run(Path(path), folder.absolute(), settings, how, resume, executor or Serial(), progress)
+    return filter_file(path, out, task="reconstruct", dt=dt, **options)
 
 
 def _run(

@@ -231,6 +231,7 @@ def test_a_fit_that_failed_ends_with_code_1_and_without_a_model(file: Path, tmp_
     ("on", "rmse", "smallest", "words"),
     [
         (3, 2.5, 0.1, ""),  # all pairs of NGSIM together
+        (5, 0.1, 0.1, ""),  # seconds of an even drive
         (3, 6.0, 0.1, "3 of 5 estimates are on bounds"),
         (4, 2.5, 0.1, "4 of 5 estimates are on bounds"),
         (0, 10.1, 0.1, "the gap RMSE is 10.1 m, and the gap 10 m"),
