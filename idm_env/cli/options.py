@@ -198,7 +198,7 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def spreading(**values: Any) -> None:
-        values |= {name: values[name][0] for name in FILES if len(values.get(name) or ()) == 1}
+        values |= {n: one[0] for n in FILES if isinstance(one := values.get(n), list) and len(one) == 1}
         command(**{name: _gathered(kind, values) for name, kind in groups.items()}, **values)
 
     spreading.__doc__ = inspect.cleandoc(command.__doc__ or "").partition("\nArgs:\n")[0]
