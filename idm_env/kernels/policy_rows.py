@@ -92,7 +92,7 @@ class PolicyRows(RowFunction):
         f"        m = (count + {ROWS - 1}) // {ROWS} * {ROWS}\n"
     )
     unary = {**UNARY, "exp": "exp({0})", "sigmoid": "sigmoid({0})", "tanh": "tanh({0})"}  # noqa: RUF012
-    simpler = _SIMPLER
+    simpler, lean = _SIMPLER, False
 
     def __init__(
         self, function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor], rows: int,

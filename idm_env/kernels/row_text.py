@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 
 UNARY = {
     "reciprocal": "(F(1.0) / {0})", "neg": "(-{0})", "abs": "abs({0})", "sqrt": "np.sqrt({0})",
-    "exp": "np.exp({0})", "expm1": "np.expm1({0})", "rsqrt": "(F(1.0) / np.sqrt({0}))", "log": "np.log({0})",
+    "exp": "np.exp({0})", "log1p": "np.log1p({0})",
+    "expm1": "np.expm1({0})", "rsqrt": "(F(1.0) / np.sqrt({0}))", "log": "np.log({0})",
     "floor": "np.floor({0})", "round": "np.rint({0})", "isinf": "np.isinf({0})", "sin": "np.sin({0})",
     "cos": "np.cos({0})", "relu": "larger({0}, F(0))", "tanh": "np.tanh({0})", "logical_not": "(not {0})",
     "bitwise_not": "(not {0})", "sign": "F(np.sign({0}))", "sgn": "F(np.sign({0}))",
@@ -52,6 +55,9 @@ _ELEMENT = re.compile(r"\b(?:[fdib]|out_\w+)\[U\((\d+|r)[^\[\]]*\]")
 """An element of the workspace or of an output: its text, and where its storage begins."""
 
 
+_STORAGE = re.compile(r"\b([fdib])\[U\((\d+)")
+"""Where an element of the workspace begins, whatever its index is."""
+
 _NUMBER = re.compile(r"v\d+ = ")
 """A number of a row, with a name of its own."""
 
@@ -92,33 +98,99 @@ def _elements(text: str) -> list[tuple[str, str]]:
     return [(m.group(), m.group().split("[")[0] + m.group(1)) for m in _ELEMENT.finditer(text)]
 
 
-def fused(parts: Sequence[list[str]]) -> list[str]:
-    """Return loops behind one another; neighbours over one shape as one, where that changes nothing."""
-    text: list[str] = []
+VECTOR = 8
+"""Numbers that are computed at once: room in the workspace is taken in such pieces."""
+_ONE_LOOP = re.compile(r"for j0 in range\((\d+)\):")
+_FIRST = re.compile(r"\b(?:[fdib]|t\d+)\[U\(\d+ \+ j0 \* 1\)\]| if j0 == \d+ else ")
+"""An element of the workspace, or of a table, in a loop that begins where its storage does; or which of them it is."""
+
+
+_UNSAFE = re.compile(r"\[U\([^\]]*\b[fdib]\[|^i\[.* (%|//) ")
+"""An index that is an element of the workspace, or a remainder: behind a storage's numbers may lie anything."""
+
+
+def padded(count: int) -> int:
+    """Return how much room so many numbers take in the workspace."""
+    return -(-count // VECTOR) * VECTOR
+
+
+def _in_vectors(head: Sequence[str], line: str, widths: Mapping[str, int]) -> bool:
+    """Return whether a loop may compute the room behind its numbers, too: the rest would go one by one."""
+    over = _ONE_LOOP.fullmatch(head[0]) if len(head) == 1 else None
+    if over is None or int(over[1]) <= VECTOR // 2 or "j0" in _FIRST.sub("", line) or _UNSAFE.search(line):
+        return False
+    return widths.get(_elements(line.split(" = ")[0])[0][1]) == int(over[1])
+
+
+def _local(groups: Sequence[tuple[list[str], list[str]]]) -> None:
+    """Give names to elements of one loop alone: a name needs no memory."""
+    everywhere = Counter("".join(m.groups()) for _, lines in groups for line in lines for m in _STORAGE.finditer(line))
+    for head, lines in groups:
+        if not head:
+            continue
+        here = Counter(_elements("\n".join(lines)))
+        written = set[str]()
+        names = {}
+        for line in lines:
+            to, value = line.split(" = ", 1)
+            text, store = _elements(to)[0]
+            single = here[text, store] == everywhere[store] and text[0] != "o"
+            if single and store not in written and text not in value:
+                names[text] = f"x{store}"
+            written.add(store)
+        lines[:] = [_ELEMENT.sub(lambda m, own=names: own.get(m.group(), m.group()), line) for line in lines]
+
+
+def _statements(lines: Sequence[str]) -> list[list[str]]:
+    """Return lines as statements: each begins with a line that is not indented."""
+    begins = [i for i, line in enumerate(lines) if not line.startswith(" ")]
+    return [list(lines[i:j]) for i, j in pairwise([*begins, len(lines)])]
+
+
+def fused(parts: Sequence[list[str]], widths: Mapping[str, int] | None = None) -> list[str]:
+    """Return loops behind one another; neighbours over one shape as one, where that changes nothing.
+
+    ``widths`` are how many numbers of a row lie in a storage. With them these loops are all there is.
+    Then what only one of them needs takes no memory. They fill whole vectors, too.
+    """
+    groups: list[tuple[list[str], list[str]]] = []
     group: _Group | None = None
+    vectors = False
 
     def close() -> None:
         nonlocal group
         if group is not None:
-            text.extend(group.head)
-            text.extend("    " * len(group.head) + line for line in group.lines)
+            groups.append((group.head, group.lines))
             group = None
 
-    for lines in parts:
+    for lines in [statement for part in parts for statement in _statements(part)]:
         *head, last = lines
         line = last.strip()
         if group is not None and _NUMBER.match(line) and not head and group.lets_by(line):
-            text.append(line)
+            groups.append(([], [line]))
             continue
         plain_loop = head and all(x.strip().startswith("for ") for x in head) and _elements(line.split(" = ")[0])
         if not plain_loop:
             close()
-            text.extend(lines)
-        elif group is None or group.head != head or not group.takes(line):
+            groups.append(([], lines))
+            continue
+        whole = widths is not None and _in_vectors(head, line, widths)
+        if group is None or group.head != head or whole != vectors or not group.takes(line):
             close()
-            group = _Group(head)
+            group, vectors = _Group(head), whole
             group.takes(line)
     close()
+    vectors_of = [
+        widths is not None and bool(head) and all(_in_vectors(head, line, widths) for line in lines)
+        for head, lines in groups
+    ]
+    if widths is not None:
+        _local(groups)
+    text: list[str] = []
+    for (head, lines), whole in zip(groups, vectors_of, strict=True):
+        if whole:
+            head = [_ONE_LOOP.sub(lambda m: f"for j0 in range({padded(int(m[1]))}):", head[0])]
+        text += [*head, *("    " * len(head) + line for line in lines)]
     return text
 
 

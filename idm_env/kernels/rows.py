@@ -8,9 +8,11 @@ of views. Whatever does not depend on the inputs is a constant.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from idm_env.compat import Uncompiled
 from idm_env.kernels.memory import addresses
-from idm_env.kernels.row_text import BINARY, COMPARE, REDUCE, UNARY, body, fused, loops
+from idm_env.kernels.row_text import BINARY, COMPARE, REDUCE, UNARY, VECTOR, body, fused, loops, padded
 from idm_env.scalar import library
 from idm_env.scalar.record import Untraceable
 from idm_env.types import recording
@@ -108,7 +110,8 @@ class RowFunction:
     ``inputs`` are examples with ``rows`` rows each. ``needs`` are the names of those that are read, and ``outs`` of
     those that are filled: in this order, behind what is ``fixed``, ``call`` takes their addresses. ``shapes`` and
     ``types`` are those of the outputs, without rows. ``constants`` are the outputs that depend on no input, without
-    rows, and ``same`` those that are another one, in a shape of their own; ``apart`` fills these, too.
+    rows, and ``same`` those that are another one, in a shape of their own; ``apart`` fills these, too. ``pitches`` are
+    distances from row to row of outputs that do not lie one behind another.
 
     Raises:
         Untraceable: For an operation that is not known here, or mixes rows.
@@ -118,14 +121,16 @@ class RowFunction:
     """How it is compiled, what is imported for that, and operations on single numbers."""
     around = "    for r in range(begin, end):\n"
     """The loop over rows."""
+    lean = True
+    """Whether every element of the workspace stands in the text as such."""
     simpler: Mapping[Any, Callable[..., Any]] = {}
     """What stands for an operation, by its name in torch."""
 
     def __init__(
         self, function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor], rows: int, *,
-        apart: bool = False,
+        apart: bool = False, pitches: Mapping[str, int] | None = None,
     ) -> None:  # fmt: skip
-        self._rows = rows
+        self._rows, self._pitches = rows, pitches or {}
         self._places: dict[int, Place] = {}
         self._noted: list[Tensor] = []
         self._stores: dict[int, tuple[str, str, int]] = {}
@@ -136,6 +141,8 @@ class RowFunction:
         self._parts: list[list[str]] = []
         operations, results = recorded(function, inputs, self.simpler)
         self._floats = next(x.dtype for x in (*inputs.values(), *results.values()) if x.is_floating_point())
+        self._loads: dict[int, list[str]] = {}
+        self._widths: dict[str, int] = {}
         for name, x in inputs.items():
             self._given(name, x)
         self._blanks: dict[int, float] = {}
@@ -147,6 +154,8 @@ class RowFunction:
         _refuse_forks(operations, list(inputs.values()))
         calls = _needed(operations, list(results.values()))
         self._calls = calls
+        read = {storage(x) for _, args, _, _ in calls for x in tensors(args)} | {storage(x) for x in results.values()}
+        self._parts += [lines for where, lines in self._loads.items() if where in read]
         for call in calls:
             self._print(*call)
         self.constants = {name: self._plain(x) for name, x in results.items() if not (apart or self._known(x))}
@@ -159,7 +168,7 @@ class RowFunction:
         self.types = {name: TYPES.get(kind, real) for name, kind in kinds.items()}
         for name, x in moving.items():
             self._parts.append(self._tell(name, x, kinds[name]))
-        lines = fused(self._parts)
+        lines = fused(self._parts, self._widths if self.lean else None)
         lines = self._first(lines) + lines
         text = "\n".join(lines)
         self.needs = [name for name in inputs if re.search(rf"\bin_{name}\b", text)]
@@ -172,6 +181,8 @@ class RowFunction:
         arguments = "".join(
             f"    {n} = carray(located(at[{k}], {_TEXT[kind]}), SIZE)\n" for k, (n, kind) in enumerate(typed)
         )
+        # By a name of its own a constant is no memory that the loops might write to.
+        arguments += "".join(f"    c{k} = c[{k}]\n" for k in range(len(self._constants) if self.lean else 0))
         room = {kind: max(1, size) for kind, size in self._room.items()}
         parts = {"options": self.options, "imports": self.imports.format(kind=real.name), "around": self.around}
         header = HEADER.format(kind=real.name, arguments=arguments, **parts, **room)
@@ -181,6 +192,11 @@ class RowFunction:
         """Addresses that every call begins with."""
         self.call: int = library.load("rows", header + body(lines)).run.address
         """Address of the loops: (first row, row behind the last, addresses of arrays that hold row after row)."""
+
+    @cached_property
+    def run(self) -> Callable[[int, int, int], None]:
+        """The loops: (first row, row behind the last, address of a ``table``). They run without the interpreter."""
+        return ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)(self.call)
 
     def table(self, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the addresses for a call, from arrays by name; those that are missing are 0."""
@@ -193,13 +209,18 @@ class RowFunction:
 
     def _given(self, name: str, x: Tensor) -> None:
         """Enter an input."""
-        width = x.numel() // self._rows
-        self._keep(x, f"in_{name}", f"r * {width}", width, self._kind(x))
+        width = x.untyped_storage().nbytes() // x.element_size() // self._rows
+        if not self.lean or x.dim() > 2 or 1 < width <= VECTOR // 2:
+            self._keep(x, f"in_{name}", f"r * {width}", width, self._kind(x))
+            return
+        to, lies = self._fresh(x), Place(f"in_{name}", f"r * {width}", 0, (1,) * (x.dim() - 1), "")
+        self._loads[storage(x)] = self._each(to, x.shape[1:], lambda cell: index(lies, cell))
 
     def _tell(self, name: str, x: Tensor, kind: str) -> list[str]:
         """Print how an output is filled."""
         strides = tuple(math.prod(x.shape[k + 1 :]) for k in range(1, x.dim()))
-        to = Place(f"out_{name}", f"r * {math.prod(x.shape[1:])}", 0, strides, kind)
+        pitch = self._pitches.get(name, math.prod(x.shape[1:]))
+        to = Place(f"out_{name}", f"r * {pitch}", 0, strides, kind)
         return self._each(to, x.shape[1:], lambda cell: self._at(x, cell))
 
     def _first(self, lines: Sequence[str]) -> list[str]:
@@ -272,7 +293,8 @@ class RowFunction:
             self._keep(x, f"v{len(self._places)}", "", 1, kind)
         else:
             self._keep(x, kind, str(self._room[kind]), width, kind)
-            self._room[kind] += width
+            self._widths[f"{kind}{self._room[kind]}"] = width
+            self._room[kind] += padded(width)
         return self._places[id(x)]
 
     def _plain(self, x: Tensor) -> np.ndarray:
@@ -288,7 +310,8 @@ class RowFunction:
             key = float(value)
             if key != key:
                 return "F(np.nan)"
-            return f"c[{self._constants.setdefault(key, len(self._constants))}]"
+            which = self._constants.setdefault(key, len(self._constants))
+            return f"c{which}" if self.lean else f"c[{which}]"
         if kind == "d":
             return f"np.float64({float(value)!r})" if math.isfinite(value) else f"np.float64(np.{float(value)!r})"
         return str(bool(value)) if kind == "b" else str(int(value))
@@ -319,7 +342,8 @@ class RowFunction:
             self._table_of[id(x)] = f"t{len(self._tables)}"
             real = values.astype(np.float32 if self._floats == torch.float32 else np.float64)
             flat = real if self._kind(x) == "f" else values
-            self._tables.append(np.ascontiguousarray(flat).reshape(-1))
+            # Loops over whole vectors read on behind it.
+            self._tables.append(np.concatenate((flat.reshape(-1), np.zeros(VECTOR, flat.dtype))))
         strides = tuple(math.prod(values.shape[k + 1 :]) for k in range(values.ndim))
         return Place(self._table_of[id(x)], "0", 0, strides, self._kind(x))
 

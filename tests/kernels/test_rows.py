@@ -1,4 +1,4 @@
-"""What rows record is what torch does: single operations, and a whole step on several lanes."""
+"""What rows record is what torch does: whole vectors or not, single operations, a whole step on several lanes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ pytest.importorskip("numba")
 from idm_env import IDM, Lanes, Simulator
 from idm_env.effects import Mobil, make
 from idm_env.envs.plan import examples_of, named, world_of
-from idm_env.kernels.rows import RowFunction
+from idm_env.kernels.rows import RowFunction, adjoint
 from idm_env.multilane.demand import trips, waiting
 from idm_env.roads.layout import lane_drop
 from idm_env.tasks import EnvState
@@ -21,12 +21,31 @@ from idm_env.tasks import EnvState
 ROWS, MANY = 3, 1009
 
 
-def called(loops, arrays):
+def called(loops, arrays, rows=ROWS):
     """Return the outputs of some rows."""
-    out = {n: np.empty((ROWS, *shape), loops.types[n]) for n, shape in loops.shapes.items()}
+    out = {n: np.empty((rows, *shape), loops.types[n]) for n, shape in loops.shapes.items()}
     table = loops.table(arrays | out)
-    ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)(loops.call)(0, ROWS, table.ctypes.data)
+    ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)(loops.call)(0, rows, table.ctypes.data)
     return out
+
+
+@pytest.mark.parametrize("size", [3, 8, 22])
+def test_rows_of_any_length_and_their_adjoint_are_torchs(size):
+    def around(x):
+        ahead = torch.cat((x[:, -1:], x[:, :-1]), dim=-1)
+        return {"y": torch.where(ahead > x, ahead / x, x * x - ahead), "total": (x[:, 1:] * x[:, :-1]).sum(-1)}
+
+    x = torch.rand(MANY, size, dtype=torch.float64) + 0.5
+    seeds = {f"on_{n}": torch.rand_like(v) for n, v in around(x).items()}
+    back = adjoint(around, ["y", "total"], ["x"])
+
+    def pulled(**leaves):
+        return {"to_x": back(**leaves)["x"]}
+
+    for function, inputs in ((around, {"x": x}), (pulled, {"x": x, **seeds})):
+        out = called(RowFunction(function, inputs, MANY, apart=True), {n: v.numpy() for n, v in inputs.items()}, MANY)
+        for name, expected in function(**inputs).items():
+            np.testing.assert_allclose(out[name], expected.numpy(), rtol=1e-14)
 
 
 def test_searches_rolls_and_reductions_by_index():
