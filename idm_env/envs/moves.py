@@ -5,7 +5,8 @@ Shapes: rows are environments: states ``[rows, n]``, actions and commands ``[row
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Callable, Mapping
 from functools import reduce
 from typing import Any
 
@@ -25,6 +26,12 @@ class Moves:
         self._limit = None if settings.limit is None else settings.limit * settings.task.held
         # With torch output always the step itself, so that values are the same bits with and without a graph.
         self._advance = self.task.simulator.step if settings.output == "torch" else self.task.simulator.advance
+
+    def by(self, advance: Callable[..., Any]) -> Moves:
+        """Return the same functions, with another one that advances the traffic by Δt."""
+        other = copy.copy(self)
+        other._advance = advance
+        return other
 
     def step(
         self,

@@ -1,4 +1,4 @@
-"""The worlds of a batch as arrays that compiled loops step (``plan.py``), with a graph where one is asked for.
+"""The worlds of a batch as arrays that compiled loops step (``transition.py``), with a graph where one is asked for.
 
 A step is one node of autograd: its forward pass and its vector-Jacobian product are the plan's. Between steps the graph
 goes through the blocks of the world, one tensor, and a token that stands for the past.
@@ -8,7 +8,6 @@ Shapes: worlds are blocks ``[rows · vehicles]`` of every leaf, what is told has
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,11 +16,11 @@ import torch
 from torch import Tensor
 
 from idm_env.delay_buffer import PAST
-from idm_env.envs.lane_plan import WHOLE, Chain, Crossing, LanePlan
+from idm_env.envs.lane_transition import LaneTransition
 from idm_env.envs.moves import Moves
 from idm_env.envs.past import Past
-from idm_env.envs.plan import Array, Bound, Layout, Moment, Plan, named, world_of
-from idm_env.kernels.lanes import past_tensor
+from idm_env.envs.transition import CompiledTransition, Tables
+from idm_env.envs.worlds import WHOLE, Array, Layout, Moment, named, world_of
 from idm_env.scalar.record import Untraceable
 from idm_env.tasks import EnvState
 from idm_env.types import Params, mapped
@@ -39,7 +38,7 @@ class Values:
 
     def __init__(self, moves: Moves, *, graph: bool) -> None:
         self._moves, self._graph = moves, graph
-        self._plans: dict[tuple[bool, bool], Plan] = {}
+        self._plans: dict[tuple[bool, bool], CompiledTransition] = {}
         self._key: Any = None
         self.layout = Layout((), {}, 0)
         self.blocks: Tensor
@@ -47,7 +46,6 @@ class Values:
         self._token: Tensor | None = None
         self._clock: Array
         self._whole: Array | None = None
-        self._chain: Chain | None = None
         self.past: Past
         self._world: EnvState
         self._glance: EnvState | None = None
@@ -71,10 +69,10 @@ class Values:
         still = {n: np.array(x.numpy(), order="C").reshape(-1) for n, x in leaves.items() if n not in blocks}
         self._clock = still.pop("state_step")
         whole = [still.pop(n) for n in WHOLE if n in still]
-        self._whole, self._chain = np.stack(whole) if whole else None, None
+        self._whole = np.stack(whole) if whole else None
         old = self.layout.still
         if still.keys() != old.keys() or not all(np.array_equal(x, old[n]) for n, x in still.items()):
-            self.layout = Layout((*blocks, "clock"), still, self.layout.version + 1)
+            self.layout = Layout(blocks, still, self.layout.version + 1)
         self.blocks = _block(world, self.layout.blocks)
         self.past = Past(world.state, writes_once=self._graph)
         self.past.load(world.state)
@@ -91,7 +89,7 @@ class Values:
             self.blocks = self.blocks.index_copy(1, index, blocks)
             self._clock, self.past = self._clock.copy(), self.past.copy()
             if self._token is not None:
-                self._token = _Forget.apply(self._token, index, tuple(fresh.state.speed.shape))
+                self._token = _Forget.apply(self._token, index)
         else:
             self.blocks[:, index] = blocks
         self._clock[rows] = leaves["state_step"]
@@ -100,8 +98,6 @@ class Values:
             self._whole = self._whole.copy()
             for i, name in enumerate(n for n in WHOLE if n in leaves):
                 self._whole[i].reshape(len(self._clock), -1)[rows] = leaves[name]
-        if self._chain is not None:
-            self._chain.stale[rows] = True
         for name, held in self.layout.still.items():
             values = leaves[name]
             old = held.reshape(len(self._clock), *values.shape[1:])
@@ -155,12 +151,9 @@ class Values:
         if command is not None and not command.flags.c_contiguous:
             command = np.ascontiguousarray(command)  # loops read row after row
         if self.past.slots:
-            self.past.make_room()
-        moment = Moment(
-            0, 0, self._clock, command, live, normals, at, self.past.rows, self.past.newest, bound
-        )  # fmt: skip
-        if self._whole is not None:
-            moment.lanes = Crossing(self._whole, self._chain, self._graph)
+            self.past.room()
+        past = self.past
+        moment = Moment(self._clock, command, live, normals, at, past.numbers, past.newest, bound, self._whole)
         outputs: dict[str, Any]
         if self._graph and torch.is_grad_enabled() and self._differentiated(action, bound):
             outputs = self._noted(plan, moment, action, bound)
@@ -173,43 +166,41 @@ class Values:
                 clock = outputs.pop("clock")
                 outputs = {n: torch.from_numpy(x) for n, x in outputs.items()} | {"clock": clock}
         self._clock, self._glance = outputs.pop("clock"), None
-        if moment.lanes is not None:
-            self._whole, self._chain = moment.lanes.whole_later, moment.lanes.chain
+        if moment.crossing is not None:
+            self._whole = moment.crossing.whole_later
         if self.past.slots:
-            self.past.newest += 1
+            self.past.newest -= 1
         return outputs
 
     def arrive(self, blocks: Tensor, clock: Array, token: Tensor | None = None) -> None:
         """Go on from other worlds of the same episodes."""
         self.blocks, self._clock, self._token = blocks, clock, token
 
-    def token_of(self, plan: Plan) -> Tensor | None:
+    def token_of(self, plan: CompiledTransition) -> Tensor | None:
         """Return the token that stands for the past, if there is one."""
         if self._token is None and self.past.slots:
-            return self.blocks.new_zeros(1).expand(plan.slots * plan.kernel.signals, plan.count)
+            return self.blocks.new_zeros(1).expand(plan.past_shape)
         return self._token
 
     def mark(self) -> tuple[Any, ...]:
         """Return what ``back_to`` goes back to."""
-        return self.blocks, self._clock, self._token, self.layout, self.past, self.past.rows, self.past.newest
+        return self.blocks, self._clock, self._token, self.layout, self.past, self.past.numbers, self.past.newest
 
     def back_to(self, mark: tuple[Any, ...]) -> None:
         """Go back to the worlds as they were: steps have written nothing that these read."""
-        self.blocks, self._clock, self._token, self.layout, self.past, self.past.rows, self.past.newest = mark
+        self.blocks, self._clock, self._token, self.layout, self.past, self.past.numbers, self.past.newest = mark
 
-    def plan(self, kind: tuple[bool, bool], draws: tuple[str, ...]) -> Plan:
-        """Return the plan of steps of a kind (``Plan``), made once."""
+    def plan(self, kind: tuple[bool, bool], draws: tuple[str, ...]) -> CompiledTransition:
+        """Return the transition of a kind, made once."""
         plan = self._plans.get(kind)
         if plan is None:
             world = self.glance()
-            make = Plan if world.state.lanes is None else LanePlan
+            make = CompiledTransition if world.state.lanes is None else LaneTransition
             plan = make(self._moves, world, self.layout, kind, draws)
-            if self._graph:
-                _ = plan.recorded.backward
             self._plans[kind] = plan
         return plan
 
-    def _differentiated(self, action: Any, bound: Bound) -> bool:
+    def _differentiated(self, action: Any, bound: Tables) -> bool:
         return bool(
             self.blocks.requires_grad
             or self._token is not None
@@ -217,7 +208,7 @@ class Values:
             or (isinstance(action, Tensor) and action.requires_grad)
         )
 
-    def _noted(self, plan: Plan, moment: Moment, action: Any, bound: Bound) -> dict[str, Any]:
+    def _noted(self, plan: CompiledTransition, moment: Moment, action: Any, bound: Tables) -> dict[str, Any]:
         """Do a step as a node of autograd."""
         outputs: dict[str, Any] = {}
         parameters = [x for _, x in bound.wanted]
@@ -225,14 +216,14 @@ class Values:
         out = _Step.apply(plan, moment, outputs, self.blocks, action, token, *parameters)
         self.blocks = out[0]
         self._token = out[1] if self.past.slots else None
-        outputs.update(zip(plan.recorded.flowing, out[2:], strict=True))
+        outputs.update(zip(moment.bound.recorded.flowing, out[2:], strict=True))
         return outputs
 
 
 class _Step(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, plan: Plan, moment: Moment, told: dict[str, Any], blocks: Tensor, action: Tensor | None,
+        ctx: Any, plan: CompiledTransition, moment: Moment, told: dict[str, Any], blocks: Tensor, action: Tensor | None,
         token: Tensor | None, *wanted: Tensor,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
         later = torch.empty_like(blocks)
@@ -243,7 +234,7 @@ class _Step(torch.autograd.Function):
         ctx.save_for_backward(blocks, later, action, token, *wanted)
         ctx.set_materialize_grads(False)
         past = None if token is None else token_like(token)
-        return (later, past, *(told[n] for n in plan.recorded.flowing))
+        return (later, past, *(told[n] for n in moment.bound.recorded.flowing))
 
     @staticmethod
     def backward(ctx: Any, on_later: Tensor | None, on_past: Tensor | None, *on_told: Tensor | None) -> Any:  # type: ignore[override]
@@ -251,7 +242,7 @@ class _Step(torch.autograd.Function):
         blocks, _, action, token, *parameters = ctx.saved_tensors
         if torch.is_grad_enabled():
             return (None,) * 3 + _twice(ctx, blocks, action, token, parameters, (on_later, on_past, *on_told))
-        names = plan.recorded.flowing
+        names = moment.bound.recorded.flowing
         seeds = {n: None if x is None else x.contiguous() for n, x in zip(names, on_told, strict=True)}
         later = None if on_later is None else on_later.contiguous()
         past = None if on_past is None else on_past.contiguous().numpy()
@@ -271,7 +262,7 @@ def _twice(
     """Return gradients with a graph of their own, for second derivatives, from the torch path."""
     plan, moment = ctx.plan, ctx.moment
     later, past, by_name = _again(plan, moment, blocks, action, token, moment.bound.with_values(parameters))
-    outputs = [later, past, *(by_name[n] for n in plan.recorded.flowing)]
+    outputs = [later, past, *(by_name[n] for n in moment.bound.recorded.flowing)]
     pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if o is not None and s is not None and o.requires_grad]
     sources = [x for x in (blocks, action, token, *parameters) if x is not None and x.requires_grad]
     gradients = iter(
@@ -285,16 +276,20 @@ def _twice(
 
 
 def _again(
-    plan: Plan, moment: Moment, blocks: Tensor, action: Tensor | None, token: Tensor | None, params: Params
+    plan: CompiledTransition,
+    moment: Moment,
+    blocks: Tensor,
+    action: Tensor | None,
+    token: Tensor | None,
+    params: Params,
 ) -> tuple[Tensor, Tensor | None, dict[str, Tensor]]:
     """Do a step by torch: blocks and past Δt later and what is told, with a graph that can be differentiated."""
     assert moment.bound is not None
-    layout, shape = moment.bound.laid.layout, tuple(blocks.shape[1:])
-    past = _recent(moment, plan, shape)
+    layout, shape = moment.bound.layout, tuple(blocks.shape[1:])
+    past = _recent(moment, plan)
     if past is not None and token is not None:
         past = _Leave.apply(token, past)
-    whole = None if moment.lanes is None else moment.lanes.whole
-    world = _world(plan.world, layout, blocks, moment.clock, past, whole)
+    world = _world(plan.world, layout, blocks, moment.clock, past, moment.whole)
     live = None if moment.live is None else torch.from_numpy(moment.live).view(shape[0], -1)
     normal_blocks = moment.normals
     normals = (
@@ -304,7 +299,7 @@ def _again(
     )
     after, outputs = plan.moves.step(world, action, live, normals, params)
     last = after.state.memory.get(PAST)
-    return _block(after, layout.blocks), None if last is None else _as_rows(last, shape), outputs
+    return _block(after, layout.blocks), None if last is None else last.movedim(1, -1), outputs
 
 
 def _world(
@@ -328,25 +323,16 @@ def _world(
 def _block(world: EnvState, names: Sequence[str]) -> Tensor:
     """Return what steps change of worlds as one tensor, with its graph."""
     state = world.state
-    clock = state.step.to(state.speed.dtype).unsqueeze(-1)
-    leaves = named(world) | {"clock": clock}
+    leaves = named(world)
     return torch.stack([leaves[n].to(state.speed.dtype).expand(state.speed.shape) for n in names])
 
 
-def _recent(moment: Moment, plan: Plan, shape: tuple[int, ...]) -> Tensor | None:
+def _recent(moment: Moment, plan: CompiledTransition) -> Tensor | None:
     """Return the past that a step began with, as the state holds it."""
-    if not plan.slots:
+    if not plan.past_shape:
         return None
-    signals = plan.kernel.signals
-    end = (moment.newest + 1) * signals
-    last = moment.past[end - plan.slots * signals : end].reshape(plan.slots, signals, -1)[::-1]
-    return past_tensor(np.ascontiguousarray(last).reshape(-1, last.shape[-1]), plan.slots, shape)
-
-
-def _as_rows(past: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Return a past, or what falls on it, as (slots · signals, vehicles), newest first."""
-    full = past.expand(*shape, *past.shape[-2:]).movedim((-2, -1), (0, 1))
-    return full.reshape(full.shape[0] * full.shape[1], -1)
+    last = moment.past[:, moment.newest : moment.newest + plan.past_shape[1]]
+    return torch.from_numpy(last.copy()).movedim(-1, 1)
 
 
 def token_like(token: Tensor) -> Tensor:
@@ -355,17 +341,16 @@ def token_like(token: Tensor) -> Tensor:
 
 
 class _Enter(torch.autograd.Function):
-    """From a past to the token that stands for it: its gradient is that of the past."""
+    """From a past to the token that stands for it, ``(rows, slots, signals, n)``: its gradient is that of the past."""
 
     @staticmethod
     def forward(ctx: Any, past: Tensor, shape: tuple[int, ...]) -> Tensor:
-        ctx.shape, ctx.full = past.shape, (*past.shape[-2:], *shape)
-        slots, signals, *_ = ctx.full
-        return past.new_zeros(1).expand(slots * signals, math.prod(shape))
+        ctx.shape = past.shape
+        return past.new_zeros(1).expand(shape[0], *past.shape[-2:], shape[1])
 
     @staticmethod
     def backward(ctx: Any, on_token: Tensor) -> Any:  # type: ignore[override]
-        return on_token.reshape(ctx.full).movedim((0, 1), (-2, -1)).sum_to_size(ctx.shape), None
+        return on_token.movedim(-1, 1).sum_to_size(ctx.shape), None
 
 
 class _Leave(torch.autograd.Function):
@@ -377,21 +362,20 @@ class _Leave(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, on_past: Tensor) -> Any:  # type: ignore[override]
-        return _as_rows(on_past, tuple(on_past.shape[:-2])), None
+        return on_past.movedim(1, -1), None
 
 
 class _Forget(torch.autograd.Function):
     """A token after some rows began anew: nothing flows back into what they were."""
 
     @staticmethod
-    def forward(ctx: Any, token: Tensor, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
-        ctx.rows, ctx.vehicles = rows, shape[-1]
+    def forward(ctx: Any, token: Tensor, rows: Tensor) -> Tensor:
+        ctx.rows = rows
         return token_like(token)
 
     @staticmethod
     def backward(ctx: Any, on_token: Tensor) -> Any:  # type: ignore[override]
-        apart = on_token.view(len(on_token), -1, ctx.vehicles)
-        return apart.index_fill(1, ctx.rows, 0.0).view_as(on_token), None, None
+        return on_token.index_fill(0, ctx.rows, 0.0), None
 
 
 _DYNAMIC = {f"state_{name}" for name in ("position", "speed", "accel", "gap", "present")}

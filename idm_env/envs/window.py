@@ -15,12 +15,14 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from idm_env.envs.plan import Array, Bound, Plan, address
+from idm_env.envs.transition import CompiledTransition, Tables
 from idm_env.envs.values import token_like
+from idm_env.envs.worlds import Array, address
+from idm_env.kernels import threads as pool
 from idm_env.kernels.policy_rows import PolicyRows
 from idm_env.kernels.rows import RowFunction, adjoint
 from idm_env.kernels.sameness import digest
-from idm_env.kernels.window_loop import window, window_back
+from idm_env.kernels.window_loop import AHEAD, BLOCK, window, window_back
 from idm_env.scalar.record import Untraceable
 
 if TYPE_CHECKING:
@@ -196,11 +198,8 @@ class _Segment(NamedTuple):
 
     first: int
     last: int
-    bound: Bound
-    normals: Any
-    at: int
-    past: Array
-    newest: int
+    bound: Tables
+    given: dict[str, Any]
 
 
 def _each(x: Array, part: slice) -> Array:
@@ -218,83 +217,76 @@ def _columns(loops: RowFunction, pointers: Mapping[str, Any], part: slice) -> Ar
 
 
 class Tape:
-    """What a window keeps: worlds before and after every step, and what was seen, remembered, done and commanded.
+    """What a window keeps: worlds before and after every step, and what was seen, remembered, done and returned.
 
     Everything else is computed once more backwards.
     """
 
     def __init__(
-        self, plan: Plan, driver: Driver, steps: int, blocks: Tensor, seen: Tensor, hidden: Tensor, push: Tensor
-    ) -> None:
+        self, plan: CompiledTransition, bound: Tables, driver: Driver, steps: int, blocks: Tensor, seen: Tensor,
+        hidden: Tensor, push: Tensor,
+    ) -> None:  # fmt: skip
         self.plan, self.driver, self.steps = plan, driver, steps
         rows, kind = plan.rows, plan.real
         self.worlds = torch.from_numpy(np.empty((steps, *blocks.shape), kind))  # numpy asks for large pages
         self.held: list[Any] = [blocks, push]
-        self.between, self.told = plan.between.take(steps)[0], plan.told.take(steps)[0]
+        self.outputs = bound.room.take(steps)[0]
         self.seen = np.empty((steps + 1, seen.numel()), kind)
         self.seen[0] = seen.reshape(-1).numpy()
         self.hidden = np.empty((steps + 1, hidden.numel()), kind)
         self.hidden[0] = hidden.reshape(-1).numpy()
-        self.final = self.told["observation"].reshape(steps, -1)
+        self.final = self.outputs["observation"].reshape(steps, -1)
         self.push = push.numpy()
         self.action = np.empty((steps, push.numel()), kind)
         self.later = self.worlds.data_ptr() + np.arange(steps, dtype=np.int64) * blocks.numel() * blocks.element_size()
         self.now = np.concatenate(([blocks.data_ptr()], self.later[:-1]))
-        self.clocks, self.later_clocks = np.empty((2, steps, rows), np.int64)
-        self.ends, self.cuts = (self._flag(n) for n in ("whole_terminated", "whole_truncated"))
+        self.clocks = np.empty((steps + 1, rows), np.int64)
+        self.ends, self.cuts = (self.outputs[f"whole_{n}"].reshape(steps, rows) for n in ("terminated", "truncated"))
         self.segments: list[_Segment] = []
+        self._blocks = -(-rows // BLOCK)
+        self._threads = 1 if plan.count * AHEAD < 2 * pool.GRAIN else pool.count(plan.count * AHEAD)
 
-    def _flag(self, name: str) -> Array:
-        return self.tell(name).reshape(self.steps, self.plan.rows)
-
-    def tell(self, name: str) -> Array:
-        """Return what is told of every step under a name."""
-        after = self.plan.recorded.after
-        other, shape = after.same.get(name, (name, ()))
-        if other in self.told:
-            return self.told[other].reshape(self.steps, self.plan.rows, *(shape or after.shapes[other]))
-        return np.repeat(self.plan.constant[name][None], self.steps, 0)
-
-    def given(self, part: slice, normals: Mapping[str, Array] | None) -> dict[str, Any]:
+    def given(self, part: slice, batch: Batch, values: Values) -> dict[str, Any]:
         """Return the addresses of what steps are given beside their worlds."""
-        pointers: dict[str, Any] = {n: address(x) for n, x in (normals or {}).items()}
-        pointers |= {n: _each(x, part) for n, x in self.between.items()}
-        pointers |= {n: pointers[o] for n, (o, _) in self.plan.recorded.before.same.items()}
-        pointers |= {"action": _each(self.action, part), "state_step": _each(self.clocks, part)}
-        return pointers | {"later_state_step": _each(self.later_clocks, part)}
+        plan, past, count = self.plan, values.past, np.arange(part.stop - part.start, dtype=np.int64)
+        _, normals = batch.ahead()
+        self.held += [normals, past.numbers]
+        pointers: dict[str, Any] = {
+            f"normal_{n}": address(x) + (batch.used + count) * plan.pitch for n, x in (normals or {}).items()
+        }
+        if past.slots:
+            pointers["past"] = address(past.numbers) + (past.newest - count) * plan.slot
+            pointers["then_past"] = pointers["past"] - plan.slot
+        return pointers | {"action": _each(self.action, part), "state_step": _each(self.clocks, part)}
 
     def run(self, batch: Batch, values: Values, weights: Mapping[str, Array]) -> None:
         """Do all steps; episodes that end begin anew."""
         plan, done = self.plan, 0
         self.clocks[0] = values.clock().numpy()
         while done < self.steps:
-            ahead, normals = batch.ahead()
-            room = values.past.room() if values.past.slots else ahead
-            part = slice(done, min(self.steps, done + ahead, done + room))
+            ahead = batch.ahead()[0]
+            part = slice(
+                done, min(self.steps, done + ahead, done + (values.past.room() if values.past.slots else ahead))
+            )
             bound = plan.of(values.layout, batch.episode_params())
-            pointers, worlds = self.given(part, normals), (self.now[part], self.later[part])
-            to = pointers | {n: _each(x, part) for n, x in self.told.items()}
+            pointers, worlds = self.given(part, batch, values), (self.now[part], self.later[part])
+            to = (
+                pointers
+                | {n: _each(x, part) for n, x in self.outputs.items()}
+                | {"clock": _each(self.clocks[1:], part)}
+            )
             own = {"seen": _each(self.seen, part), "push": address(self.push), "action": pointers["action"]}
             own |= {"hidden": _each(self.hidden, part), "later": _each(self.hidden[1:], part)}
             own |= {n: address(x) for n, x in weights.items()}
-            acts = _columns(self.driver.forward, own, part)
-            tables = (
-                self.driver.forward.call, acts, plan.recorded.before.call, bound.laid.ask.filled(pointers, *worlds),
-                plan.recorded.after.call, bound.laid.tell.filled(to, *worlds), self.clocks[part],
-                self.later_clocks[part], plan.places_of(bound, pointers, *worlds),
-            )  # fmt: skip
-            past = values.past
-            count = window(
-                *tables, bound.strides, *plan.work, past.rows, past.newest, *plan.loops, batch.used, plan.groups, 0,
-                part.stop - done, self.ends[part], self.cuts[part], self.seen[done:], self.final[part],
-            )  # fmt: skip
-            self.segments.append(_Segment(done, done + count, bound, normals, batch.used, past.rows, past.newest))
+            tables = _columns(self.driver.forward, own, part), bound.ahead.filled(to, *worlds)
+            count = self._ahead(bound, *tables, part)
+            self.segments.append(_Segment(done, done + count, bound, {n: x[:count] for n, x in pointers.items()}))
             batch.used += count
-            past.newest += count if past.slots else 0
+            values.past.newest -= count if values.past.slots else 0
             done += count
-            values.arrive(self.worlds[done - 1], self.later_clocks[done - 1].copy())
+            values.arrive(self.worlds[done - 1], self.clocks[done].copy())
             over = np.flatnonzero(self.ends[done - 1] | self.cuts[done - 1])
-            batch.saw(torch.from_numpy(self.tell("observation")[done - 1].copy()))
+            batch.saw(torch.from_numpy(self.outputs["observation"][done - 1].copy()))
             if len(over):
                 fresh = batch.reset(over)
                 batch.settle()
@@ -303,51 +295,79 @@ class Tape:
                 self.held.append(values.blocks)
                 if done < self.steps:
                     self.now[done] = values.blocks.data_ptr()
-            if done < self.steps:
                 self.clocks[done] = values.clock().numpy()
+
+    def _ahead(self, bound: Tables, acts: Array, asks: Array, part: slice) -> int:
+        """Do some steps of all blocks, or until somebody's episode is over; return how many."""
+        done, last, plan = 0, part.stop - part.start, self.plan
+        arrays = self.seen[part.start :], self.final[part], self.ends[part], self.cuts[part]
+        loops = self.driver.forward.call, acts, bound.recorded.forward.call, asks, plan.rows
+        while done < last:
+            stops, until = list[int](), last if self._blocks == 1 else min(done + AHEAD, last)
+
+            def some(begin: int, end: int, first: int = done, last: int = until, stops: list[int] = stops) -> None:
+                stops.append(window(*loops, begin, end, first, last, *arrays))
+
+            pool.split(some, self._blocks, 1, self._threads)
+            done = min(stops)
+            if done < until or (self.ends[part.start + done - 1] | self.cuts[part.start + done - 1]).any():
+                break
+        return done
 
     def back(
         self, weights: Mapping[str, Array], on_seen: Array, on_last: Array, on_action: Array, on_reward: Array,
         on_worlds: Array, on_past: Array, on_hidden: Array,
     ) -> tuple[Array, Array, Array, Array, dict[str, Array]]:  # fmt: skip
         """Return what falls on first worlds, the past then, parameters, actions (every step), and sums of weights."""
-        plan, scratch, driver = self.plan, self.plan.scratch, self.driver
-        two = np.zeros((2, *on_worlds.shape), plan.real)
-        two[self.steps % 2] = on_worlds
-        pasts = np.zeros((2, *on_past.shape), plan.real)
-        pasts[self.steps % 2] = on_past
-        on_parameters = np.zeros((len(plan.kernel.program.parameters), plan.count), plan.real)
+        plan, driver, steps = self.plan, self.driver, self.steps
+        two, pasts = np.zeros((2, *on_worlds.shape), plan.real), np.zeros((2, *on_past.shape), plan.real)
+        two[steps % 2], pasts[steps % 2] = on_worlds, on_past
+        parameters, each = np.zeros((2, len(self.segments[0].bound.wanted), plan.count), plan.real)
         acted = np.zeros_like(self.action)
         on_observation, looked = np.zeros((2, self.seen.shape[1]), plan.real)
-        total, recalled, on_later = on_seen[self.steps].copy(), on_hidden.copy(), np.empty_like(on_hidden)
-        sums = {n: np.zeros(size, plan.real) for n, size in driver.backward.sums.items()}
-        moving = [i for i, n in enumerate(plan.layout.blocks) if f"end_{n}" in scratch.there]
-        carried = np.array([i for i, n in enumerate(plan.layout.blocks) if n.startswith("memory_") and i not in moving])
+        total, recalled, on_later = on_seen[steps].copy(), on_hidden.copy(), np.empty_like(on_hidden)
+        threads = min(self._threads, self._blocks)
+        sums = [{n: np.zeros(size, plan.real) for n, size in driver.backward.sums.items()} for _ in range(threads)]
+        remembers = "to_hidden" in driver.backward.outs
         for segment in reversed(self.segments):
-            part = slice(segment.first, segment.last)
-            worlds, pointers = (self.now[part], self.later[part]), self.given(part, segment.normals)
+            part, recorded = slice(segment.first, segment.last), segment.bound.recorded
             side = np.arange(part.start, part.stop) % 2
-            own = {**scratch.there, **{f"on_{n}": scratch.zeros for n in plan.recorded.flowing}, **pointers}
-            own |= {"on_observation": address(on_observation), "on_whole_reward": _each(on_reward, part)}
-            own["on_action"] = _each(acted, part)
+            falls = {f"on_{n}": address(plan.zeros) for n in recorded.flowing} | segment.given
+            falls |= {"on_observation": address(on_observation), "on_whole_reward": _each(on_reward, part)}
+            falls |= {"to_action": _each(acted, part)}
+            falls |= {"on_past": address(pasts[0]) + (1 - side) * pasts[0].nbytes}
+            falls |= {"to_past": address(pasts[0]) + side * pasts[0].nbytes}
             begins, seeds = (address(two) + k * two[0].nbytes for k in (side, 1 - side))
-            asks, tells = segment.bound.laid.back
-            see = {"seen": _each(self.seen, part), "push": address(self.push), "on_action": own["on_action"]}
-            see |= {n: address(x) for n, x in (*weights.items(), *sums.items())} | {"to_seen": address(looked)}
+            worlds = self.now[part], seeds, begins, np.full(len(side), address(each))
+            asks = segment.bound.back.filled(falls, *worlds)
+            see = {"seen": _each(self.seen, part), "push": address(self.push), "on_action": falls["to_action"]}
+            see |= {n: address(x) for n, x in weights.items()} | {"to_seen": address(looked)}
             see |= {"hidden": _each(self.hidden, part), "on_later": address(on_later), "to_hidden": address(recalled)}
-            acts = _columns(driver.backward, see, part)
-            before, after = plan.recorded.backward
-            window_back(
-                driver.backward.call, acts, before.call, asks.filled(own, *worlds, begins), after.call,
-                tells.filled(own, *worlds, seeds), plan.places_of(segment.bound, pointers, *worlds),
-                segment.bound.strides, *scratch.work, segment.past, segment.newest, scratch.ends, scratch.begins,
-                np.array([address(x) for x in pasts]), address(on_parameters), address(scratch.on_inputs),
-                *scratch.loops, segment.at, plan.groups, segment.first % 2, segment.last - segment.first,
-                self.ends[part], self.cuts[part], two, pasts, carried.astype(np.int64), on_seen[part], on_last[part],
-                on_action[part], acted[part], on_observation, looked, total,
-                recalled, on_later, "to_hidden" in driver.backward.outs,
+            shared = recorded.backward.call, asks, plan.rows, plan.size
+            arrays = (
+                segment.first % 2, segment.last - segment.first, self.ends[part], self.cuts[part], two, pasts,
+                on_seen[part], on_last[part], on_action[part], acted[part], on_observation, looked, total, recalled,
+                on_later, remembers, each, parameters,
             )  # fmt: skip
-        return two[0], pasts[0], on_parameters, acted, {**sums, "seen": total, "hidden": recalled}
+            free = list(sums)
+
+            def some(
+                begin: int,
+                end: int,
+                see: Any = see,
+                shared: Any = shared,
+                arrays: Any = arrays,
+                free: Any = free,
+                part: Any = part,
+            ) -> None:
+                own = {n: address(x) for n, x in free.pop().items()}
+                window_back(
+                    driver.backward.call, _columns(driver.backward, see | own, part), *shared, begin, end, *arrays
+                )
+
+            pool.split(some, self._blocks, 1, threads)
+        summed = {n: sum((x[n] for x in sums[1:]), sums[0][n]) for n in sums[0]}
+        return two[0], pasts[0], parameters, acted, {**summed, "seen": total, "hidden": recalled}
 
 
 class _Window(torch.autograd.Function):
@@ -369,7 +389,7 @@ class _Window(torch.autograd.Function):
         return (
             values.blocks.clone(), None if token is None else token_like(token),
             torch.from_numpy(tape.seen).view(steps + 1, rows, -1), torch.from_numpy(tape.action).view(shaped),
-            torch.from_numpy(tape.tell("whole_reward")).view(steps, rows), torch.from_numpy(tape.final).view(shaped),
+            torch.from_numpy(tape.outputs["whole_reward"]).view(steps, rows), torch.from_numpy(tape.final).view(shaped),
             torch.from_numpy(tape.hidden[-1]).view(hidden.shape),
         )  # fmt: skip
 
@@ -379,7 +399,6 @@ class _Window(torch.autograd.Function):
         tape, plan = ctx.tape, ctx.tape.plan
         blocks, seen, hidden, push, *tensors = ctx.saved_tensors
         weights = {n: x.detach().numpy() for n, x in zip(ctx.names, tensors, strict=False)}
-        signals = plan.slots * plan.kernel.signals
 
         def dense(x: Tensor | None, *shape: int) -> Array:
             return np.zeros(shape, plan.real) if x is None else np.ascontiguousarray(x.numpy()).reshape(shape)
@@ -387,11 +406,12 @@ class _Window(torch.autograd.Function):
         steps, wide, acts = tape.steps, tape.seen.shape[1], tape.action.shape[1]
         on_now, on_past, on_parameters, acted, sums = tape.back(
             weights, dense(on[2], steps + 1, wide), dense(on[5], steps, wide), dense(on[3], steps, acts),
-            dense(on[4], steps, plan.rows), dense(on[0], len(blocks), plan.count), dense(on[1], signals, plan.count),
+            dense(on[4], steps, plan.rows), dense(on[0], len(blocks), plan.count),
+            dense(on[1], *(plan.past_shape or (plan.rows, 1, 1, 1))),
             dense(on[6], hidden.numel()),
         )  # fmt: skip
         gradients: list[Tensor | None] = [torch.from_numpy(on_now).view(blocks.shape)]
-        gradients.append(torch.from_numpy(on_past) if signals else None)
+        gradients.append(torch.from_numpy(on_past) if plan.past_shape else None)
         gradients.append(torch.from_numpy(sums["seen"]).view(seen.shape))
         gradients.append(torch.from_numpy(sums["hidden"]).view(hidden.shape))
         gradients.append(torch.from_numpy(acted.sum(0)).view(push.shape))
@@ -416,12 +436,10 @@ def compiled(
     if driver is None:
         return None
     plan = values.plan((False, True), batch.task.simulator.draws)
-    if plan.size > plan.extent[3]:
-        return None
     first = values.blocks
     begun = seen.new_zeros(len(seen), 0) if hidden is None else hidden
-    tape = Tape(plan, driver, steps, first.detach(), seen.detach(), begun.detach(), push.detach())
     bound = plan.of(values.layout, batch.episode_params())
+    tape = Tape(plan, bound, driver, steps, first.detach(), seen.detach(), begun.detach(), push.detach())
     token = values.token_of(plan)
     weights = driver.weights(policy)
     tensors = (*weights.values(), *(x for _, x in bound.wanted))

@@ -12,7 +12,7 @@ import numpy as np
 from idm_env.kernels.compiler import apart
 from idm_env.kernels.memory import copy, fill, gather, number
 from idm_env.kernels.order_loops import walk
-from idm_env.kernels.phases import call
+from idm_env.kernels.phases import call, call_rows
 from idm_env.kernels.tiles import ROW, exact, padded, workspace
 
 CHUNK = 256
@@ -355,3 +355,19 @@ def decide(
         copy(orders, base, order, 0, n)
         copy(begins, row * (count + 1), begin, 0, count + 1)
     return True
+
+
+@exact
+def each_row(loops, rows, table):
+    """Call loops over single rows."""
+    for row in rows:
+        call_rows(loops, row, row + 1, table)  # type: ignore[call-arg]
+
+
+@exact
+def mark_led(rows, n, leader, follower, led, leads):
+    """Write who has a leader and who a follower, as numbers."""
+    for row in rows:
+        for i in range(n):
+            led[row * n + i] = leader[row * n + i] != i
+            leads[row * n + i] = follower[row * n + i] != i

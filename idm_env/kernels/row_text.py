@@ -130,7 +130,7 @@ def _local(groups: Sequence[tuple[list[str], list[str]]]) -> None:
             continue
         here = Counter(_elements("\n".join(lines)))
         written = set[str]()
-        names = {}
+        names = dict[str, str]()
         for line in lines:
             to, value = line.split(" = ", 1)
             text, store = _elements(to)[0]
@@ -138,7 +138,11 @@ def _local(groups: Sequence[tuple[list[str], list[str]]]) -> None:
             if single and store not in written and text not in value:
                 names[text] = f"x{store}"
             written.add(store)
-        lines[:] = [_ELEMENT.sub(lambda m, own=names: own.get(m.group(), m.group()), line) for line in lines]
+
+        def renamed(element: re.Match[str], names: Mapping[str, str] = names) -> str:
+            return names.get(element.group(), element.group())
+
+        lines[:] = [_ELEMENT.sub(renamed, line) for line in lines]
 
 
 def _statements(lines: Sequence[str]) -> list[list[str]]:

@@ -84,13 +84,12 @@ def test_what_was_made_ahead_is_forgotten_with_the_seed_and_the_parameters(chang
 def test_a_past_returns_to_its_begin_and_keeps_what_counts():
     batch = Batch(settings(task="ring", warmup=0, effects=["delay"]), 2)
     state = batch.task.begin(batch._draws(np.arange(2), np.zeros(2, np.int64)), batch.params).state
-    past, told = Past(state), np.random.default_rng(0).normal(size=(200, *state.memory[PAST].shape[-1:], 44))
+    past, told = Past(state), np.random.default_rng(0).normal(size=(200, 2, *state.memory[PAST].shape[-1:], 22))
     past.load(state)
-    expected = list(past.tensor().movedim((-2, -1), (0, 1)).reshape(past.slots, -1, 44).numpy())
+    expected = list(past.tensor().movedim((-2, -1), (0, 2)).numpy())
     for signals in told.astype(np.float32):
-        past.make_room()
-        past.newest += 1
-        past.rows.reshape(-1, *signals.shape)[past.newest] = signals
+        past.room()
+        past.newest -= 1
+        past.numbers[:, past.newest] = signals
         expected = [signals, *expected[:-1]]
-        held = past.tensor().movedim((-2, -1), (0, 1)).reshape(past.slots, -1, 44).numpy()
-        np.testing.assert_array_equal(held, np.stack(expected))
+        np.testing.assert_array_equal(past.tensor().movedim((-2, -1), (0, 2)).numpy(), np.stack(expected))

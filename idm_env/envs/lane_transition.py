@@ -1,0 +1,356 @@
+"""A step of a batch on several lanes: who comes and goes and changes lanes, then the whole step as on one lane.
+
+Choices are frozen; what they do to gaps and memories is recorded as everything else, with its adjoint.
+
+Shapes: worlds are blocks ``[rows · vehicles]`` of every leaf, and as many whole numbers; rows are indices ``[k]``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from idm_env.delay_buffer import PAST
+from idm_env.envs.moves import Moves
+from idm_env.envs.transition import CompiledTransition, Tables, WholeStep
+from idm_env.envs.worlds import WHOLE, Array, Group, Layout, Moment, Room, RowTable, address, named, world_of
+from idm_env.kernels import lane_change_loops
+from idm_env.kernels.lane_changes import decision, rows_of
+from idm_env.kernels.lanes import part_of, static_of
+from idm_env.kernels.operands import operand
+from idm_env.kernels.rows import RowFunction, adjoint, storage
+from idm_env.multilane.demand import turned
+from idm_env.multilane.incentives import seen_merging
+from idm_env.roads import Lanes
+from idm_env.roads.merging import on_lanes
+from idm_env.scalar.record import Form, Unordered, Untraceable, slot_name
+from idm_env.tasks import EnvState
+from idm_env.types import LINKS, Params
+
+
+@dataclass
+class Crossing:
+    """What becomes of lanes in one step: worlds after decisions, blocks and whole numbers, and these after the step.
+
+    ``turned`` are rows in which vehicles may come and go, and ``decided`` those in which lanes were decided about;
+    ``fresh`` marks new leaders then, and ``merger`` who signals beside whom.
+    """
+
+    mid: Tensor
+    whole_mid: Array
+    whole_later: Array
+    turned: Array = field(default_factory=lambda: np.empty(0, np.int64))
+    decided: Array = field(default_factory=lambda: np.empty(0, np.int64))
+    fresh: Array = field(default_factory=lambda: np.empty(0, np.bool_))
+    merger: Array = field(default_factory=lambda: np.empty(0, np.int64))
+
+
+class Stage:
+    """A function of worlds that changes some of their leaves, as loops over rows, and its adjoint.
+
+    ``function`` returns the leaves that it changes; gradients flow through blocks and to the leaves ``more``, which are
+    no part of worlds.
+    """
+
+    def __init__(
+        self, plan: LaneTransition, function: Callable[..., dict[str, Tensor]], examples: Mapping[str, Tensor],
+        many: int, more: Sequence[str] = (),
+    ) -> None:  # fmt: skip
+        self.plan, self.more, self._many = plan, tuple(more), many
+        self._function, self._examples = function, examples
+        self.loops = RowFunction(self._then, examples, many, apart=True)
+
+    def _then(self, **leaves: Tensor) -> dict[str, Tensor]:
+        return {f"then_{n}": x for n, x in self._function(**leaves).items()}
+
+    @cached_property
+    def back(self) -> RowFunction:
+        """The adjoint: from ``pass_NAME``, what falls on the leaves afterwards, to ``new_NAME`` before."""
+        blocks = self.plan.layout.blocks
+        passes = {f"pass_{n}": self._examples[n].clone() for n in blocks}
+        changed = [n for n in blocks if f"then_{n}" in self.loops.outs]
+        back = adjoint(self._then, [f"then_{n}" for n in changed], [*blocks, *self.more])
+
+        def through(**leaves: Tensor) -> dict[str, Tensor]:
+            passed = {n: leaves.pop(f"pass_{n}") for n in blocks}
+            gradients = back(**leaves, **{f"on_then_{n}": passed[n] for n in changed})
+            past = {n: 0.0 * x if n in changed else x for n, x in passed.items()}
+            before = {n: gradients[n] + x if n in gradients else x.clone() for n, x in past.items()}
+            before |= {n: gradients[n] for n in self.more if n in gradients}
+            return {f"new_{n}": x for n, x in before.items()}
+
+        return RowFunction(through, {**self._examples, **passes}, self._many, apart=True)
+
+    def run(self, still: Mapping[str, Array], rows: Array, own: Mapping[str, int], *begins: int) -> None:
+        """Change some rows (indices): blocks and whole numbers before it, and those after it, begin there."""
+        groups = self.plan.groups("") + self.plan.groups("then_")
+        lane_change_loops.each_row(self.loops.call, rows, RowTable(self.loops, still, groups).filled(own, *begins))
+
+    def through(
+        self, still: Mapping[str, Array], rows: Array, own: Mapping[str, int], begins: Sequence[int], on: Array
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Return what falls on blocks before the stage and on ``more``, from what falls on those after it."""
+        blocks, pitch, before = self.plan.layout.blocks, self.plan.pitch, on.copy()
+        more = np.zeros((len(self.more), self.plan.count), on.dtype)
+        groups = *self.plan.groups(""), ("pass_", blocks, pitch), ("new_", blocks, pitch), ("new_", self.more, pitch)
+        table = RowTable(self.back, still, groups).filled(own, *begins, address(on), address(before), address(more))
+        lane_change_loops.each_row(self.back.call, rows, table)
+        return before, more
+
+
+class Commands:
+    """What a step is given beside its worlds, as drivers see it who think of changing lanes."""
+
+    def __init__(self, step: WholeStep, moves: Moves, world: EnvState) -> None:
+        normals = {n.removeprefix("normal_"): x for n, x in step.inputs.items() if n.startswith("normal_")}
+        self.inputs: dict[str, Any] = {}
+        self.normals: dict[str, str] = {}
+
+        def inputs_of(**leaves: Tensor) -> dict[str, Tensor]:
+            _, _, inputs = moves.commanded(
+                world_of(leaves, world), leaves.get("action"), normals or None, leaves.get("live")
+            )
+            self.inputs.update(inputs)
+            out = {}
+            for effect, value in inputs.items():
+                for part, x in ({"": value} if isinstance(value, Tensor) else value._asdict()).items():
+                    if x is not None and x is normals.get(effect):
+                        self.normals[slot_name(effect, part)] = f"normal_{effect}"
+                    elif x is not None:
+                        out[slot_name(effect, part).replace(" ", "_")] = x
+            return out
+
+        examples = {n: x for n, x in step.inputs.items() if n in step.sample or n in ("action", "live")}
+        self.loops = RowFunction(inputs_of, examples, step.many)
+
+
+class LaneTables(Tables):
+    """What parameters give, on several lanes: also what drivers look at who think of changing lanes."""
+
+    plan: LaneTransition
+
+    def __init__(self, plan: LaneTransition, layout: Layout, params: Params) -> None:
+        super().__init__(plan, layout, params)
+        self._arrays: list[Array] = []
+        self.clock = np.empty(plan.rows, plan.real)
+        self.ask = RowTable(plan.commands.loops, layout.still, plan.groups(""))
+        self.decides: Any = None if plan.found is None else self._decision(plan.found)
+
+    def _decision(self, wishes: Any) -> Any:
+        """Return the plan of what drivers wish, and what in it moves: blocks, what is given, and who is led.
+
+        Untraceable for wishes that look at what no plan has.
+        """
+        plan, blocks, inputs = self.plan, list[tuple[int, int]](), list[tuple[int, str]]()
+        marks = {n: np.ones(1 if plan.ring else plan.count, plan.real) for n in ("led", "leads")}
+
+        def find(i: int, name: str) -> tuple[int, int, int]:
+            by_mark = (0, 0, 0) if plan.ring else (0, plan.size, 1)
+            source, by = (marks[name], by_mark) if name in marks else self._source(name)
+            if isinstance(source, str):
+                inputs.append((i, source))
+                return 0, *by[1:]
+            if isinstance(source, int):
+                blocks.append((i, source * plan.pitch))
+                return 0, *by[1:]
+            self._arrays.append(source)
+            return address(source), *by[1:]
+
+        rows, places = rows_of(wishes.slots, find)
+        which, offsets = np.array(blocks, np.int64).reshape(-1, 2).T
+        return rows, places, which, offsets, inputs, marks, wishes.compiled(plan.real.name)
+
+    def _source(self, name: str) -> tuple[Array | str | int, tuple[int, int, int]]:
+        """Return an array, the name of what is given with every step, or the number of a block; and its strides."""
+        plan, loops, by_vehicle = self.plan, self.plan.commands.loops, (0, self.plan.size, 1)
+        block = f"memory_{name.removeprefix('memory of ')}" if name.startswith("memory of ") else f"state_{name}"
+        if block in self.layout.blocks:
+            return self.layout.blocks.index(block), by_vehicle
+        if name == "step":
+            return self.clock, (0, 1, 0)
+        if block in self.layout.still:
+            return self.layout.still[block], by_vehicle
+        if not name.endswith(" now"):
+            x = static_of(plan.task.simulator, plan.world.state, self.params, name)
+            return operand(x.to(plan.world.state.speed.dtype), (plan.rows,), plan.size)
+        if name in plan.commands.normals:
+            return plan.commands.normals[name], by_vehicle
+        own = name.replace(" ", "_")
+        own, shape = loops.same.get(own, (own, loops.shapes.get(own)))
+        if shape is None:
+            x = part_of(plan.commands.inputs, name)
+            x = x[:1] if x.dim() == 2 and len(x) == plan.many else x
+            array, by = operand(x, (plan.rows,), plan.size)
+            return array.astype(plan.real), by
+        if loops.types[own] != plan.real:
+            raise Untraceable(f"drivers who change lanes look at {name.removesuffix(' now')}")
+        wide = shape[-1] if shape else 1
+        return own, (0, wide, 0 if wide < plan.size else 1)
+
+
+class LaneTransition(CompiledTransition):
+    """Steps on several lanes, as ``CompiledTransition``."""
+
+    worlds = ("", "mid_")
+
+    def __init__(
+        self, moves: Moves, world: EnvState, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
+    ) -> None:  # fmt: skip
+        simulator, road = moves.task.simulator, moves.task.simulator.road
+        assert isinstance(road, Lanes)
+        self.road = road
+        if road.duration:
+            raise Untraceable("compiled changes take no time, and Lanes has a duration")
+        if PAST in world.state.memory:
+            raise Untraceable("an effect looks back, where vehicles change lanes")
+        self.ring = float(self.road.ring or 0.0)
+        self._whole = [n for n in WHOLE if n in named(world)]
+        super().__init__(moves, world, layout, kind, draws)
+        self.tables = np.array([self.road.table(name) for name in ("opens", "closes", "stops")], self.real)
+        self._absent = np.empty(0, self.real)
+        self._turns: dict[WholeStep, Stage] = {}
+        turns = simulator.decides_in_blocks
+        self.turns = simulator.turns(self.size).numpy() if turns else np.empty(0, np.int64)
+        self._stages = np.unique(self.turns) if turns else np.zeros(1, np.int64)
+        self._spare: Tensor | None = None
+
+    def groups(self, prefix: str) -> tuple[Group, ...]:
+        """Return how worlds lie: blocks, and whole numbers."""
+        return *super().groups(prefix), (prefix, self._whole, self.count * np.dtype(np.int64).itemsize)
+
+    # -- what is recorded beside ---------------------------------------------------------------------------------
+
+    def _tables(self, layout: Layout, params: Params) -> Tables:
+        """Lay out what parameters give."""
+        step = self.recorded(params)
+        if not hasattr(self, "commands"):
+            self._record(step)
+        if self.world.state.present is not None and step not in self._turns:
+            self._turns[step] = Stage(self, self._turned(step), step.sample, step.many, step.wanted)
+        return LaneTables(self, layout, params)
+
+    def _record(self, step: WholeStep) -> None:
+        """Record commands, and what decisions do."""
+        simulator, self.many = self.task.simulator, step.many
+        commands = Commands(step, self.moves, self.world)
+        self.found: Any = None
+        self.room = Room({n: (self.rows, *s) for n, s in commands.loops.shapes.items()}, commands.loops.types)
+        if simulator.lane_change_models:
+            self.found = decision(simulator, Form.of(self.world.state._replace(lanes=None), commands.inputs))
+            if isinstance(self.found, str):
+                raise Untraceable(self.found)
+            examples = {n: x for n, x in step.sample.items() if n not in step.parameters}
+            like = torch.zeros(step.many, self.size, dtype=torch.int64)
+            sees = {"merger": like} if simulator.sees_mergers else {}
+            self.settle = Stage(self, self._settled, {**examples, "fresh": like == 0, **sees}, step.many)
+        self.commands = commands
+
+    def _turned(self, step: WholeStep) -> Callable[..., dict[str, Tensor]]:
+        """Return the function of what changes where vehicles come and go."""
+
+        def changed(**leaves: Tensor) -> dict[str, Tensor]:
+            world = world_of(leaves, self.world)
+            now = torch.ones_like(world.state.speed[..., :1], dtype=torch.bool)
+            after = turned(self.task.simulator, world.state, step.params_of(leaves), now)
+            return {n: x for n, x in named(world._replace(state=after)).items() if storage(x) != storage(leaves[n])}
+
+        return changed
+
+    def _settled(self, **leaves: Tensor) -> dict[str, Tensor]:
+        """Return gaps to new leaders, and who signals, after a decision."""
+        state = world_of(leaves, self.world).state
+        view = self.road.view(state)
+        gap = torch.where(leaves["fresh"], view.gaps(state.position, state.length), state.gap)
+        after = on_lanes(state)
+        if "merger" in leaves:
+            due = torch.ones_like(gap, dtype=torch.bool) if state.present is None else state.present > 0
+            after = seen_merging(view, after, leaves["merger"], due)
+        held = {f"memory_{n}": x for n, x in after.memory.items() if x is not state.memory[n]}
+        return {"state_gap": gap, **held}
+
+    # -- forwards ------------------------------------------------------------------------------------------------
+
+    def begins(self, moment: Moment, now: Tensor, later: Tensor, tape: bool) -> tuple[int, ...]:
+        """Decide about lanes; return where worlds begin: before it, after it, and after the step.
+
+        Unordered, with nothing changed, where links are not the order of positions.
+        """
+        bound, whole = moment.bound, moment.whole
+        assert isinstance(bound, LaneTables) and whole is not None
+        lanes = moment.crossing = Crossing(now, whole, whole)
+        phase = moment.clock % self.task.simulator.decides_after
+        if bound.recorded in self._turns:
+            lanes.turned = np.flatnonzero(phase == 0)
+        if self.found is not None:
+            lanes.decided = np.flatnonzero(np.isin(phase, self._stages) if len(self._stages) > 1 else phase == 0)
+        begins = now.data_ptr(), address(whole)
+        if len(lanes.turned) or len(lanes.decided):
+            mid = torch.empty_like(now) if tape or self._spare is None else self._spare
+            self._spare = None if tape else mid
+            lanes.mid, lanes.whole_mid = mid.copy_(now.detach()), whole.copy()
+            after, step = (mid.data_ptr(), address(lanes.whole_mid)), {"state_step": moment.given["state_step"]}
+            if len(lanes.turned):
+                self._turns[bound.recorded].run(bound.still, lanes.turned, step, *begins, *after)
+            if len(lanes.decided):
+                self._decide(moment, bound, phase[lanes.decided], begins)
+                self.settle.run(bound.still, lanes.decided, self._decision_inputs(moment), *after, *after)
+        by_record = any(n.startswith("then_links") for n in bound.recorded.forward.outs)
+        lanes.whole_later = lanes.whole_mid.copy() if by_record else lanes.whole_mid
+        return *begins, lanes.mid.data_ptr(), address(lanes.whole_mid), later.data_ptr(), address(lanes.whole_later)
+
+    def _decision_inputs(self, moment: Moment) -> dict[str, int]:
+        """Return the addresses of what ``_settled`` is given beside worlds."""
+        own = {"fresh": address(moment.crossing.fresh), "merger": address(moment.crossing.merger)}
+        return own | {"state_step": moment.given["state_step"]}
+
+    def _decide(self, moment: Moment, bound: LaneTables, stages: Array, begins: Sequence[int]) -> None:
+        """Let vehicles change lanes, in the worlds after some have come and gone."""
+        lanes = moment.crossing
+        plan, places, which, offsets, inputs, marks, (phase_at, constants) = bound.decides
+        plan[which, lane_change_loops.ADDRESS] = offsets + lanes.mid.data_ptr()
+        bound.clock[:] = moment.clock
+        if inputs:
+            _outputs, where = self.room.take()
+            table = bound.ask.filled(moment.given | where, *begins)
+            self.commands.loops.run(0, self.rows, address(table))
+            for i, name in inputs:
+                plan[i, lane_change_loops.ADDRESS] = (moment.given | where)[name]
+        if not self.ring:
+            lane_change_loops.mark_led(lanes.decided, self.size, *lanes.whole_mid[1:3], marks["led"], marks["leads"])
+        lanes.fresh = np.zeros(self.count, np.uint8)
+        lanes.merger = np.tile(np.arange(self.size), self.rows if self.task.simulator.sees_mergers else 0)
+        order, begin = np.empty(self.count, np.int64), np.empty(self.rows * (self.road.count + 1), np.int64)
+        blocks = dict(zip(self.layout.blocks, lanes.mid.view(len(lanes.mid), -1).numpy(), strict=True))
+        coming = "state_present" in blocks
+        if not lane_change_loops.decide(
+            lanes.whole_mid[: len(LINKS)], blocks["state_position"], blocks.get("state_present", self._absent), coming,
+            lanes.decided, stages, self.size, self.road.count, self.ring, self.road.handed == "left", self.tables,
+            plan, places, phase_at, constants, len(self.found.slots), lanes.fresh, lanes.merger, self.turns, order,
+            begin,
+        ):  # fmt: skip
+            raise Unordered("links are not the order of positions")
+
+    # -- backwards -----------------------------------------------------------------------------------------------
+
+    def _first(self, moment: Moment, on_worlds: Array, on_parameters: Array) -> Array:
+        """Return what falls on the worlds before decisions; what falls on parameters there is added."""
+        bound, lanes, (on, between) = moment.bound, moment.crossing, on_worlds
+        assert isinstance(bound, LaneTables)
+        if len(lanes.decided):
+            mid = lanes.mid.data_ptr(), address(lanes.whole_mid)
+            between, _ = self.settle.through(bound.still, lanes.decided, self._decision_inputs(moment), mid, between)
+        if len(lanes.turned):
+            step = {"state_step": moment.given["state_step"]}
+            turn = self._turns[bound.recorded]
+            between, more = turn.through(bound.still, lanes.turned, step, moment.begins[:2], between)
+            on_parameters += more
+        return on + between  # type: ignore[no-any-return]
+
+
+__all__ = ["Crossing", "LaneTransition"]

@@ -1,0 +1,338 @@
+"""A step of a batch: one function of worlds, recorded whole with torch's derivative (``kernels.rows``).
+
+What an environment does between two observations is in ``moves``; nothing of it is written twice. On several lanes
+decisions come first (``lane_transition``). What holds for many steps is laid out once; a call hands over addresses.
+
+Shapes: worlds are blocks ``[rows · vehicles]`` of every leaf, parameters ``[rows, 1]`` or ``[rows, vehicles]``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from idm_env.delay_buffer import PAST
+from idm_env.envs.moves import Moves
+from idm_env.envs.past import ROOM
+from idm_env.envs.worlds import (
+    WHOLE,
+    Array,
+    Group,
+    Layout,
+    Moment,
+    Room,
+    RowTable,
+    address,
+    examples_of,
+    named,
+    world_of,
+)  # fmt: skip
+from idm_env.kernels import threads as pool
+from idm_env.kernels.past_in_place import Stepper
+from idm_env.kernels.rows import RowFunction, adjoint, storage
+from idm_env.scalar.record import Untraceable
+from idm_env.tasks import EnvState
+from idm_env.types import Params, State
+
+_ROWS = (1009, 1013, 1019, 1021, 1031)
+"""Numbers of rows of a recording: one that is no other dimension tells rows apart from everything else."""
+
+Form = tuple[tuple[str, str, bool, bool], ...]
+"""Parameters as a recording knows them: effect, name, whether vehicles differ, and whether a gradient is wanted."""
+
+
+class WholeStep:
+    """A step of worlds as a function of rows, and its adjoint.
+
+    ``kind`` says whether nobody acts, and whether all actions count; ``told`` are the outputs beside worlds.
+    """
+
+    def __init__(
+        self, moves: Moves, world: EnvState, blocks: Sequence[str], kind: tuple[bool, bool], draws: Sequence[str],
+        form: Form,
+    ) -> None:  # fmt: skip
+        (idle, every), task, like = kind, moves.task, world.state
+        self._world, self._blocks, self._draws = world, blocks, tuple(draws)
+        size, agents = like.speed.shape[-1], len(task.agents)
+        many = self.many = next(p for p in _ROWS if p not in (size, agents))
+        real = like.speed.dtype
+        self.sample = inputs = examples_of(world, many)
+        # On several lanes vehicles drive in the worlds after decisions: agents have commanded in those before.
+        self.changing = [] if like.lanes is None else [*blocks, *(n for n in WHOLE if n in inputs)]
+        inputs = inputs | {f"mid_{n}": inputs[n].clone() for n in self.changing}
+        if not idle:
+            inputs["action"] = torch.zeros(many, agents * len(task.commands), dtype=real)
+        if not (idle or every):
+            inputs["live"] = torch.ones(many, agents, dtype=torch.bool)
+        inputs |= {f"normal_{n}": torch.zeros(many, size, dtype=real) for n in draws}
+        self.parameters = {f"p{i}": (e, p) for i, (e, p, _, _) in enumerate(form)}
+        wide = {f"p{i}": size if per_vehicle else 1 for i, (_, _, per_vehicle, _) in enumerate(form)}
+        self.sample = self.sample | {n: torch.ones(many, count, dtype=real) for n, count in wide.items()}
+        inputs |= {n: self.sample[n] for n in wide}
+        self.wanted = [f"p{i}" for i, (_, _, _, flows) in enumerate(form) if flows]
+        past, pitches = like.memory.get(PAST), {}
+        if past is not None:
+            slots, count = past.shape[-2:]
+            pitches["then_past"] = (slots + ROOM) * count * size
+            room = torch.zeros(many, slots + ROOM, count, size, dtype=real)
+            inputs["past"] = room[:, :slots].movedim(-1, 1)
+        self.inputs, self._moves = inputs, moves
+        flowing = [*blocks, *(f"mid_{n}" for n in blocks if self.changing)]
+        self._by = [*flowing, *(n for n in ("action", "past") if n in inputs), *self.wanted]
+        simulator = task.simulator
+        self._stepper = Stepper(simulator.road, simulator.effects, simulator.dt, simulator.integration)
+        self.forward = RowFunction(self._step, inputs, many, apart=True, pitches=pitches)
+        self.told = [n for n in self.forward.outs if not n.startswith("then_")]
+
+    def _step(self, **leaves: Tensor) -> dict[str, Tensor]:
+        """Return the worlds Δt later and what is told."""
+        world = world_of(leaves, self._world)
+        if "past" in leaves:
+            memory = {**world.state.memory, PAST: leaves["past"]}
+            world = world._replace(state=world.state._replace(memory=memory))
+        mid = {n: leaves[f"mid_{n}"] for n in self.changing}
+        driving = world_of({**leaves, **mid}, self._world).state if mid else world.state
+
+        def drive(_: State, inputs: Any, params: Params) -> State:
+            return self._stepper.step(driving, inputs, params)
+
+        normals = {n: leaves[f"normal_{n}"] for n in self._draws} or None
+        after, outputs = self._moves.by(drive).step(
+            world, leaves.get("action"), leaves.get("live"), normals, self.params_of(leaves)
+        )
+        later = named(after)
+        out = {f"then_{n}": later[n] for n in self._blocks} | outputs | {"clock": after.state.step}
+        out |= {
+            f"then_{n}": later[n] for n in self.changing[len(self._blocks) :] if storage(later[n]) != storage(mid[n])
+        }
+        return out | ({"then_past": self._stepper.looked[0].now} if "past" in leaves else {})  # type: ignore[return-value]
+
+    def params_of(self, leaves: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
+        """Return parameters as a simulator takes them."""
+        params: dict[str, dict[str, Tensor]] = {e.name: {} for e in self._moves.task.simulator.effects}
+        for name, (effect, own) in self.parameters.items():
+            params.setdefault(effect, {})[own] = leaves[name]
+        return params
+
+    @cached_property
+    def flowing(self) -> list[str]:
+        """What is told with a derivative."""
+        with torch.enable_grad():
+            out = self._step(**{n: x.detach().requires_grad_(n in self._by) for n, x in self.inputs.items()})
+        return [n for n, x in out.items() if x.requires_grad and not n.startswith("then_")]
+
+    @cached_property
+    def backward(self) -> RowFunction:
+        """What falls on worlds, actions, wanted parameters and the past from what falls on outputs (``on_NAME``).
+
+        ``on_past`` falls on the past after the step. Untraceable where torch's derivative cannot be recorded.
+        """
+        inputs, flowing, blocks = self.inputs, self.flowing, [f"then_{n}" for n in self._blocks]
+        past = ["then_past"] if "past" in inputs else []
+        back = adjoint(self._step, [*blocks, *flowing, *past], self._by)
+        out = self._step(**inputs)
+        seeds = {f"on_{n}": torch.zeros_like(out[n]).contiguous() for n in (*blocks, *flowing)}
+        if past:
+            seeds["on_past"] = torch.zeros_like(inputs["past"].movedim(1, -1)).contiguous()
+
+        def pulled(**leaves: Tensor) -> dict[str, Tensor]:
+            on_past = leaves.pop("on_past", None)
+            gradients = back(**leaves, **({} if on_past is None else {"on_then_past": on_past[:, 0]}))
+            to = {f"to_{n}": gradients.get(n, torch.zeros_like(leaves[n])) for n in self._by if n != "past"}
+            if on_past is not None:
+                carried = torch.cat((on_past[:, 1:], torch.zeros_like(on_past[:, :1])), dim=1)
+                own = gradients.get("past")
+                to["to_past"] = carried if own is None else carried + own.movedim(1, -1)
+            return to
+
+        return RowFunction(pulled, {**inputs, **seeds}, self.many, apart=True)
+
+
+class Tables:
+    """What parameters give: the tables of a recording, with the arrays of parameters.
+
+    ``wanted`` are those that require a gradient, with their numbers.
+    """
+
+    def __init__(self, plan: CompiledTransition, layout: Layout, params: Params) -> None:
+        self.plan, self.layout, self.params = plan, layout, params
+        self.recorded = recorded = plan.recorded(params)
+        self.still = {**layout.still, **{n: self._array(params[e][p]) for n, (e, p) in recorded.parameters.items()}}
+        self.ahead = RowTable(recorded.forward, self.still, (*plan.before, *plan.groups("then_")))
+        self._watched = [(own, p, x, x._version) for own in params.values() for p, x in own.items()]
+        names = [recorded.parameters[n] for n in recorded.wanted]
+        self.wanted = [(i, params[e][p]) for i, (e, p) in enumerate(names)]
+        self.room = Room({n: (plan.rows, *recorded.forward.shapes[n]) for n in recorded.told}, recorded.forward.types)
+
+    def _array(self, x: Tensor) -> Array:
+        wide = self.plan.size if _wide(x) else 1
+        x = x.detach().to(self.plan.world.state.speed.dtype)
+        return np.array(x.expand(self.plan.rows, wide).numpy(), order="C")
+
+    @cached_property
+    def back(self) -> RowTable:
+        """The table of the adjoint."""
+        pitch, blocks = self.plan.pitch, self.layout.blocks
+        groups: list[Group] = [
+            (prefix, blocks, pitch) for prefix in ("on_then_", *(f"to_{n}" for n in self.plan.worlds))
+        ]
+        groups = [*self.plan.before, *groups, ("to_", self.recorded.wanted, pitch)]
+        return RowTable(self.recorded.backward, self.still, groups)
+
+    def with_values(self, values: Sequence[Tensor]) -> dict[str, dict[str, Tensor]]:
+        """Return the parameters with others in place of those that are ``wanted``."""
+        params = {effect: dict(own) for effect, own in self.params.items()}
+        for name, x in zip(self.recorded.wanted, values, strict=True):
+            effect, parameter = self.recorded.parameters[name]
+            params[effect][parameter] = x
+        return params
+
+    def changed(self) -> bool:
+        """Return whether a parameter is another tensor now, or was written to."""
+        # A loop: a generator would cost as much again.
+        for held, name, x, version in self._watched:  # noqa: SIM110
+            if held[name] is not x or x._version != version:
+                return True
+        return False
+
+
+class CompiledTransition:
+    """Steps of worlds with or without actions (``kind`` as in ``WholeStep``), as laid out.
+
+    Raises:
+        Untraceable: For a task or a simulator that cannot be recorded.
+    """
+
+    worlds: tuple[str, ...] = ("",)
+    """How the names of the leaves of worlds begin from which a step is computed."""
+
+    def __init__(
+        self, moves: Moves, world: EnvState, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
+    ) -> None:  # fmt: skip
+        self.moves, self.task, self.world, self.layout = moves, moves.task, world, layout
+        self.rows, self.size = world.state.speed.shape
+        self.real = np.dtype(np.float32 if world.state.speed.dtype == torch.float32 else np.float64)
+        self.count = self.rows * self.size
+        self.pitch = self.count * self.real.itemsize
+        past = world.state.memory.get(PAST)
+        self.past_shape = () if past is None else (self.rows, *past.shape[-2:], self.size)
+        self.slot = math.prod(self.past_shape[2:]) * self.real.itemsize
+        self._kind, self._draws, self._recorded = kind, draws, dict[Form, WholeStep]()
+        self._bound: Tables | None = None
+        self.threads = 1 if self.count < 2 * pool.GRAIN else pool.count(self.count)
+        self.before: tuple[Group, ...] = tuple(group for prefix in self.worlds for group in self.groups(prefix))
+
+    def groups(self, prefix: str) -> tuple[Group, ...]:
+        """Return how worlds lie, whose leaves have names that begin so."""
+        return ((prefix, self.layout.blocks, self.pitch),)
+
+    def recorded(self, params: Params) -> WholeStep:
+        """Return the step as recorded for such parameters."""
+        form = tuple((e, p, _wide(x), x.requires_grad) for e, own in params.items() for p, x in own.items())
+        if form not in self._recorded:
+            blocks = self.layout.blocks
+            self._recorded[form] = WholeStep(self.moves, self.world, blocks, self._kind, self._draws, form)
+        return self._recorded[form]
+
+    def of(self, layout: Layout, params: Params) -> Tables:
+        """Return what parameters give, laid out once for many steps."""
+        bound = self._bound
+        if bound is None or layout.version != bound.layout.version or bound.params is not params or bound.changed():
+            bound = self._bound = self._tables(layout, params)
+        return bound
+
+    def _tables(self, layout: Layout, params: Params) -> Tables:
+        """Lay out what parameters give."""
+        return Tables(self, layout, params)
+
+    # -- forwards ------------------------------------------------------------------------------------------------
+
+    def run(self, moment: Moment, now: Tensor, later: Tensor, tape: bool) -> dict[str, Array]:
+        """Do one step from blocks to blocks; return what is told.
+
+        Untraceable where an effect of the user's own returned NaN.
+        """
+        bound = moment.bound
+        assert isinstance(bound, Tables)
+        moment.given = self.pointers(moment)
+        moment.begins = self.begins(moment, now, later, tape)
+        outputs, where = bound.room.take()
+        self.split(bound.recorded.forward, bound.ahead.filled(moment.given | where, *moment.begins))
+        if self.task.simulator.own and bool(later[bound.layout.blocks.index("state_speed")].isnan().any()):
+            raise Untraceable("an effect returned nan: the step itself tells which")
+        return outputs
+
+    def begins(self, moment: Moment, now: Tensor, later: Tensor, tape: bool) -> tuple[int, ...]:
+        """Return where the worlds of a step begin (``before``), and those after it."""
+        return now.data_ptr(), later.data_ptr()
+
+    def split(self, loops: RowFunction, table: Array) -> None:
+        """Do the loops over all rows, in some threads where there are many."""
+        where = address(table)
+        if self.threads == 1:
+            loops.run(0, self.rows, where)
+        else:
+            pool.split(lambda begin, end: loops.run(begin, end, where), self.rows, 1, self.threads)
+
+    def pointers(self, moment: Moment) -> dict[str, int]:
+        """Return the addresses of all that a step is given beside its worlds: its adjoint is given the same."""
+        pointers = {"state_step": address(moment.clock)}
+        if moment.action is not None:
+            pointers["action"] = address(moment.action)
+        if moment.live is not None:
+            pointers["live"] = address(moment.live)
+        for name, x in (moment.normals or {}).items():
+            pointers[f"normal_{name}"] = address(x) + moment.at * self.pitch
+        if self.past_shape:
+            pointers["past"] = address(moment.past) + moment.newest * self.slot
+            pointers["then_past"] = pointers["past"] - self.slot
+        return pointers
+
+    # -- backwards -----------------------------------------------------------------------------------------------
+
+    @cached_property
+    def zeros(self) -> Array:
+        """What falls on outputs on which nothing falls."""
+        recorded = self._bound.recorded if self._bound is not None else next(iter(self._recorded.values()))
+        wide = (len(self.layout.blocks) * self.size, *(math.prod(s) for s in recorded.forward.shapes.values()))
+        return np.zeros(self.rows * max(wide), self.real)
+
+    def back(
+        self, moment: Moment, on_told: Mapping[str, Tensor | None], on_later: Tensor | None, on_past: Array | None
+    ) -> tuple[Array, Array | None, Array, Array]:
+        """Return what falls on the world's blocks, on actions, on parameters (parameters, vehicles) and on the past.
+
+        ``on_told`` is what falls on ``flowing``, ``on_later`` on the blocks of the world Δt later and ``on_past`` on
+        the past (rows, slots, signals, vehicles); None is nothing.
+        """
+        bound, zeros = moment.bound, address(self.zeros)
+        assert isinstance(bound, Tables)
+        on_worlds = np.empty((len(self.worlds), len(self.layout.blocks), self.count), self.real)
+        on_action = None if moment.action is None else np.zeros(moment.action.shape, self.real)
+        on_parameters = np.empty((len(bound.wanted), self.count), self.real)
+        before = np.empty(self.past_shape, self.real)
+        pointers = {f"on_{n}": zeros if x is None else x.data_ptr() for n, x in on_told.items()} | moment.given
+        if on_action is not None:
+            pointers["to_action"] = address(on_action)
+        if self.past_shape:
+            on_past = np.zeros(self.past_shape, self.real) if on_past is None else on_past
+            pointers |= {"on_past": address(on_past), "to_past": address(before)}
+        seeds = zeros if on_later is None else on_later.data_ptr()
+        begins = *moment.begins[: len(self.before)], seeds, *(address(x) for x in on_worlds), address(on_parameters)
+        self.split(bound.recorded.backward, bound.back.filled(pointers, *begins))
+        return self._first(moment, on_worlds, on_parameters), on_action, on_parameters, before
+
+    def _first(self, moment: Moment, on_worlds: Array, on_parameters: Array) -> Array:
+        """Return what falls on the first of the worlds that a step is computed from."""
+        return on_worlds[0]
+
+
+def _wide(x: Tensor) -> bool:
+    """Return whether a parameter has a number for every vehicle, or needs one for its gradient."""
+    return x.requires_grad or (x.dim() > 0 and x.shape[-1] > 1)

@@ -1,0 +1,145 @@
+"""Worlds of a batch as arrays: leaves by name, blocks in which they lie, and tables of addresses for loops over rows.
+
+Shapes: worlds are blocks ``[rows · vehicles]`` of every leaf; outputs have rows first: ``[rows, …]``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from idm_env.delay_buffer import PAST
+from idm_env.kernels.rows import RowFunction
+from idm_env.tasks import EnvState
+from idm_env.types import LINKS, State, Trips
+
+Array = np.ndarray
+Group = tuple[str, Sequence[str], int]
+"""Arrays that lie one after another: what their names begin with, their names, and the bytes of each."""
+WHOLE = (*(f"links_{n}" for n in LINKS), "trips_entered", "trips_left")
+"""Whole numbers of every vehicle that steps change, in the order in which they lie."""
+
+
+class Layout(NamedTuple):
+    """Where a world lies: numbers of every vehicle that steps change are ``blocks`` of one array, one after another.
+
+    ``still`` are the arrays of all else, and ``version`` counts how often one was replaced by another.
+    """
+
+    blocks: tuple[str, ...]
+    still: dict[str, Array]
+    version: int
+
+
+@dataclass(slots=True)
+class Moment:
+    """One step of a batch: all that its loops were given, so that its adjoint can be computed."""
+
+    clock: Array
+    action: Array | None
+    live: Array | None
+    normals: Mapping[str, Array] | None
+    at: int
+    past: Array
+    newest: int
+    bound: Any = None
+    whole: Array | None = None
+    """Whole numbers ``(WHOLE, vehicles)`` before the step, on a road of several lanes."""
+    crossing: Any = None
+    """What became of them (``lane_transition.Crossing``)."""
+    given: dict[str, int] = field(default_factory=dict)
+    """The addresses of what the step's loops were given beside its worlds."""
+    begins: tuple[int, ...] = ()
+    """Where worlds begin, before the step and after it; the caller keeps their memory."""
+
+
+class RowTable:
+    """The addresses that loops over rows are called with: what stays, groups of arrays, and what is given by name."""
+
+    def __init__(self, loops: RowFunction, still: Mapping[str, Array], groups: Sequence[Group]) -> None:
+        self._stays = loops.table(still)
+        self._given = {n: loops.place(n) for n in (*loops.needs, *loops.outs) if n not in still}
+        self._groups = [self._within(*group) for group in groups]
+
+    def _within(self, prefix: str, names: Sequence[str], pitch: int) -> tuple[Array, Array]:
+        places = {i: self._given.pop(prefix + n) for i, n in enumerate(names) if prefix + n in self._given}
+        return np.array(list(places.values()), np.int64), np.array(list(places), np.int64) * pitch
+
+    def filled(self, given: Mapping[str, Any], *begins: Any) -> Array:
+        """Return the addresses for one call, or for some: where groups begin, and what is given, is one a call then."""
+        several = isinstance(begins[0], np.ndarray)
+        cells = np.repeat(self._stays[:, None], len(begins[0]), 1) if several else self._stays.copy()
+        for (places, offsets), begin in zip(self._groups, begins, strict=True):
+            cells[places] = (offsets[:, None] if several else offsets) + begin
+        for name, place in self._given.items():
+            cells[place] = given[name]
+        return cells.T.copy() if several else cells
+
+
+class Room:
+    """Arrays of fixed shapes that are taken together: one piece of memory for each of their types."""
+
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]], types: Mapping[str, Any]) -> None:
+        self._sizes: dict[Any, int] = {}
+        self._at: list[tuple[str, Any, int, tuple[int, ...]]] = []
+        for name, shape in shapes.items():
+            kind = np.dtype(types[name])
+            begin = self._sizes.get(kind, 0)
+            self._at.append((name, kind, begin * kind.itemsize, shape))
+            self._sizes[kind] = begin + math.prod(shape)
+
+    def take(self, steps: int = 0) -> tuple[dict[str, Array], dict[str, int]]:
+        """Return fresh arrays by name, with ``steps`` as their first dimension where there are any; and addresses."""
+        own = max(steps, 1)
+        memory = {kind: np.empty(size * own, kind) for kind, size in self._sizes.items()}
+        first = {kind: address(x) for kind, x in memory.items()}
+        arrays, pointers = {}, {}
+        for name, kind, begin, shape in self._at:
+            arrays[name] = np.ndarray((steps, *shape) if steps else shape, kind, memory[kind], begin * own)
+            pointers[name] = first[kind] + begin * own
+        return arrays, pointers
+
+
+def examples_of(world: EnvState, many: int) -> dict[str, Tensor]:
+    """Return the leaves of many worlds like the first of these."""
+    leaves = {n: x.detach() for n, x in named(world).items()}
+    return {n: x[:1].expand(many, *x.shape[1:]).contiguous() for n, x in leaves.items()}
+
+
+def named(world: EnvState) -> dict[str, Tensor]:
+    """Return the tensors of a world by names that can stand in a program; the past is not among them."""
+    state = world.state
+    leaves = {f"state_{n}": x for n, x in zip(State._fields, state, strict=True) if isinstance(x, Tensor)}
+    shape = state.speed.shape
+    leaves |= {f"memory_{n}": x.expand(shape) for n, x in state.memory.items() if n != PAST}
+    if state.lanes is not None:
+        leaves |= {f"links_{n}": getattr(state.lanes, n).expand(shape) for n in LINKS}
+        trips = {} if state.lanes.trips is None else state.lanes.trips._asdict()
+        leaves |= {f"trips_{n}": x.expand(shape) for n, x in trips.items()}
+    return leaves | {f"episode_{n}": x for n, x in world.episode.items()}
+
+
+def world_of(own: Mapping[str, Tensor], like: EnvState) -> EnvState:
+    """Return a world of the leaves that ``named`` gives, memories as in ``like``."""
+    fields = {n.removeprefix("state_"): x for n, x in own.items() if n.startswith("state_")}
+    episode = {n.removeprefix("episode_"): x for n, x in own.items() if n.startswith("episode_")}
+    state, lanes = like.state._replace(**fields), like.state.lanes  # type: ignore[arg-type]
+    if lanes is not None:
+        links: Any = {n: own[f"links_{n}"] for n in LINKS}
+        lanes = lanes._replace(**links)
+        if lanes.trips is not None:
+            lanes = lanes._replace(trips=Trips(*(own[f"trips_{n}"] for n in Trips._fields)))
+        state = state._replace(lanes=lanes)
+    memory = {n: own.get(f"memory_{n}", x) for n, x in state.memory.items()}
+    return EnvState(state._replace(memory=memory), episode)
+
+
+def address(x: Array | None) -> int:
+    """Return where an array begins."""
+    assert x is not None
+    return x.__array_interface__["data"][0]  # type: ignore[no-any-return]
