@@ -139,7 +139,7 @@ class LaneTables(Tables):
         super().__init__(plan, layout, params)
         self._arrays: list[Array] = []
         self.clock = np.empty(plan.rows, plan.real)
-        self.ask = RowTable(plan.commands.loops, layout.still, plan.groups(""))
+        self.ask = RowTable(plan.commands.loops, layout.still | plan.room.arrays, plan.groups(""))
         self.decides: Any = None if plan.found is None else self._decision(plan.found)
 
     def _decision(self, wishes: Any) -> Any:
@@ -316,11 +316,10 @@ class LaneTransition(CompiledTransition):
         plan[which, lane_change_loops.ADDRESS] = offsets + lanes.mid.data_ptr()
         bound.clock[:] = moment.clock
         if inputs:
-            _outputs, where = self.room.take()
-            table = bound.ask.filled(moment.given | where, *begins)
-            self.commands.loops.run(0, self.rows, address(table))
+            self.commands.loops.run(0, self.rows, bound.ask.pointer(moment.given, tuple(begins)))
             for i, name in inputs:
-                plan[i, lane_change_loops.ADDRESS] = (moment.given | where)[name]
+                where = self.room.arrays.get(name)
+                plan[i, lane_change_loops.ADDRESS] = moment.given[name] if where is None else address(where)
         if not self.ring:
             lane_change_loops.mark_led(lanes.decided, self.size, *lanes.whole_mid[1:3], marks["led"], marks["leads"])
         lanes.fresh = np.zeros(self.count, np.uint8)

@@ -164,11 +164,14 @@ class Tables:
         self.plan, self.layout, self.params = plan, layout, params
         self.recorded = recorded = plan.recorded(params)
         self.still = {**layout.still, **{n: self._array(params[e][p]) for n, (e, p) in recorded.parameters.items()}}
-        self.ahead = RowTable(recorded.forward, self.still, (*plan.before, *plan.groups("then_")))
+        groups = *plan.before, *plan.groups("then_")
+        self.ahead = RowTable(recorded.forward, self.still, groups)
         self._watched = [(own, p, x, x._version) for own in params.values() for p, x in own.items()]
         names = [recorded.parameters[n] for n in recorded.wanted]
         self.wanted = [(i, params[e][p]) for i, (e, p) in enumerate(names)]
         self.room = Room({n: (plan.rows, *recorded.forward.shapes[n]) for n in recorded.told}, recorded.forward.types)
+        self.once = RowTable(recorded.forward, self.still | self.room.arrays, groups)
+        """The table of single steps; ``ahead`` is that of windows."""
 
     def _array(self, x: Tensor) -> Array:
         wide = self.plan.size if _wide(x) else 1
@@ -225,6 +228,7 @@ class CompiledTransition:
         self.slot = math.prod(self.past_shape[2:]) * self.real.itemsize
         self._kind, self._draws, self._recorded = kind, draws, dict[Form, WholeStep]()
         self._bound: Tables | None = None
+        self._normals: dict[str, tuple[Array, int]] = {}
         self.threads = 1 if self.count < 2 * pool.GRAIN else pool.count(self.count)
         self.before: tuple[Group, ...] = tuple(group for prefix in self.worlds for group in self.groups(prefix))
 
@@ -262,19 +266,17 @@ class CompiledTransition:
         assert isinstance(bound, Tables)
         moment.given = self.pointers(moment)
         moment.begins = self.begins(moment, now, later, tape)
-        outputs, where = bound.room.take()
-        self.split(bound.recorded.forward, bound.ahead.filled(moment.given | where, *moment.begins))
+        self.split(bound.recorded.forward, bound.once.pointer(moment.given, moment.begins))
         if self.task.simulator.own and bool(later[bound.layout.blocks.index("state_speed")].isnan().any()):
             raise Untraceable("an effect returned nan: the step itself tells which")
-        return outputs
+        return bound.room.copied()
 
     def begins(self, moment: Moment, now: Tensor, later: Tensor, tape: bool) -> tuple[int, ...]:
         """Return where the worlds of a step begin (``before``), and those after it."""
         return now.data_ptr(), later.data_ptr()
 
-    def split(self, loops: RowFunction, table: Array) -> None:
-        """Do the loops over all rows, in some threads where there are many."""
-        where = address(table)
+    def split(self, loops: RowFunction, where: int) -> None:
+        """Do the loops over all rows, with a table at an address, in some threads where there are many."""
         if self.threads == 1:
             loops.run(0, self.rows, where)
         else:
@@ -288,7 +290,9 @@ class CompiledTransition:
         if moment.live is not None:
             pointers["live"] = address(moment.live)
         for name, x in (moment.normals or {}).items():
-            pointers[f"normal_{name}"] = address(x) + moment.at * self.pitch
+            if name not in self._normals or self._normals[name][0] is not x:
+                self._normals[name] = x, address(x)
+            pointers[f"normal_{name}"] = self._normals[name][1] + moment.at * self.pitch
         if self.past_shape:
             pointers["past"] = address(moment.past) + moment.newest * self.slot
             pointers["then_past"] = pointers["past"] - self.slot
@@ -325,7 +329,7 @@ class CompiledTransition:
             pointers |= {"on_past": address(on_past), "to_past": address(before)}
         seeds = zeros if on_later is None else on_later.data_ptr()
         begins = *moment.begins[: len(self.before)], seeds, *(address(x) for x in on_worlds), address(on_parameters)
-        self.split(bound.recorded.backward, bound.back.filled(pointers, *begins))
+        self.split(bound.recorded.backward, bound.back.pointer(pointers, begins))
         return self._first(moment, on_worlds, on_parameters), on_action, on_parameters, before
 
     def _first(self, moment: Moment, on_worlds: Array, on_parameters: Array) -> Array:

@@ -230,7 +230,7 @@ class Tape:
         rows, kind = plan.rows, plan.real
         self.worlds = torch.from_numpy(np.empty((steps, *blocks.shape), kind))  # numpy asks for large pages
         self.held: list[Any] = [blocks, push]
-        self.outputs = bound.room.take(steps)[0]
+        self.outputs = bound.room.take(steps)
         self.seen = np.empty((steps + 1, seen.numel()), kind)
         self.seen[0] = seen.reshape(-1).numpy()
         self.hidden = np.empty((steps + 1, hidden.numel()), kind)

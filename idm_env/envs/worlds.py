@@ -65,6 +65,7 @@ class RowTable:
         self._stays = loops.table(still)
         self._given = {n: loops.place(n) for n in (*loops.needs, *loops.outs) if n not in still}
         self._groups = [self._within(*group) for group in groups]
+        self._recent: dict[tuple[int, ...], tuple[Array, int]] = {}
 
     def _within(self, prefix: str, names: Sequence[str], pitch: int) -> tuple[Array, Array]:
         places = {i: self._given.pop(prefix + n) for i, n in enumerate(names) if prefix + n in self._given}
@@ -80,6 +81,19 @@ class RowTable:
             cells[place] = given[name]
         return cells.T.copy() if several else cells
 
+    def pointer(self, given: Mapping[str, Any], begins: tuple[int, ...]) -> int:
+        """Return where the addresses for one call lie, until the next call: of recent worlds they are laid out."""
+        if begins not in self._recent:
+            if len(self._recent) > 1:
+                self._recent.clear()
+            cells = self.filled(given, *begins)
+            self._recent[begins] = cells, address(cells)
+            return self._recent[begins][1]
+        cells, pointer = self._recent[begins]
+        for name, place in self._given.items():
+            cells[place] = given[name]
+        return pointer
+
 
 class Room:
     """Arrays of fixed shapes that are taken together: one piece of memory for each of their types."""
@@ -92,17 +106,21 @@ class Room:
             begin = self._sizes.get(kind, 0)
             self._at.append((name, kind, begin * kind.itemsize, shape))
             self._sizes[kind] = begin + math.prod(shape)
+        self._memory = {kind: np.empty(size, kind) for kind, size in self._sizes.items()}
+        self.arrays = self._within(self._memory)
+        """Arrays that are filled again and again, by name."""
 
-    def take(self, steps: int = 0) -> tuple[dict[str, Array], dict[str, int]]:
-        """Return fresh arrays by name, with ``steps`` as their first dimension where there are any; and addresses."""
-        own = max(steps, 1)
-        memory = {kind: np.empty(size * own, kind) for kind, size in self._sizes.items()}
-        first = {kind: address(x) for kind, x in memory.items()}
-        arrays, pointers = {}, {}
-        for name, kind, begin, shape in self._at:
-            arrays[name] = np.ndarray((steps, *shape) if steps else shape, kind, memory[kind], begin * own)
-            pointers[name] = first[kind] + begin * own
-        return arrays, pointers
+    def _within(self, memory: Mapping[Any, Array]) -> dict[str, Array]:
+        return {name: np.ndarray(shape, kind, memory[kind], begin) for name, kind, begin, shape in self._at}
+
+    def copied(self) -> dict[str, Array]:
+        """Return copies of the arrays, by name."""
+        return self._within({kind: x.copy() for kind, x in self._memory.items()})
+
+    def take(self, steps: int) -> dict[str, Array]:
+        """Return fresh arrays by name, with ``steps`` as their first dimension."""
+        memory = {kind: np.empty(size * steps, kind) for kind, size in self._sizes.items()}
+        return {n: np.ndarray((steps, *shape), kind, memory[kind], at * steps) for n, kind, at, shape in self._at}
 
 
 def examples_of(world: EnvState, many: int) -> dict[str, Tensor]:
