@@ -120,7 +120,7 @@ class Room:
     def take(self, steps: int) -> dict[str, Array]:
         """Return fresh arrays by name, with ``steps`` as their first dimension."""
         memory = {kind: np.empty(size * steps, kind) for kind, size in self._sizes.items()}
-        return {n: np.ndarray((steps, *shape), kind, memory[kind], at * steps) for n, kind, at, shape in self._at}
+        return {n: np.ndarray((steps, *shape), kind, memory[kind], begin * steps) for n, kind, begin, shape in self._at}
 
 
 def examples_of(world: EnvState, many: int) -> dict[str, Tensor]:
