@@ -53,7 +53,8 @@ class SharedOptions:
         model: A model.yaml of explain: its effects stay, IDM is fitted.
         base: Car-following law: idm (the default), idm_plus, iidm, fvdm, gipps, constant_time_gap, my_file.py:MyLaw.
         layout: auto, tidy, ngsim, openacc, ultra_av, highd, exid, pneuma or i24.
-        columns: Your names and units: time_s=t,vehicle_id=car,position_m=x[ft],speed_mps=v[km/h].
+        columns: Your names and units: time_s=t,vehicle_id=car,position_m=x[ft],speed_mps=v[km/h]. Leader and follower
+            in one row, --pair: time_s=t,follower.position_m=x_f,leader.position_m=x_l, or gap_m and range_rate_mps.
         where: Only runs or drivers with "column=value"; given twice, both must hold.
         ring_length: Circumference (m), if the traffic runs on a ring.
         max_gap: Gaps above this (m) mean a lost leader and are left out.
@@ -172,7 +173,8 @@ def _for_typer(name: str, kind: Any, default: Any, meaning: str) -> Any:
     if default is inspect.Parameter.empty or POSITIONAL in marks:
         return Annotated[base, typer.Argument(help=meaning)]
     flag = f"--{name.replace('_', '-')}"
-    flags = (flag, "-o") if name == "out" else (flag,) if default is not True else ()  # True has a flag for no, too
+    others = {"out": ("-o",), "columns": ("--pair",)}.get(name, ())
+    flags = (flag, *others) if default is not True else ()  # True has a flag for no, too
     check = _trust if name == "trust" else next((Limits(*m).check for m in marks if isinstance(m, tuple)), None)
     return Annotated[base, typer.Option(*flags, help=meaning, callback=check)]
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import polars as pl
 
-from idm_env.data import drones, folder, ngsim, openacc, plain, tidy, ultra_av
+from idm_env.data import drones, folder, ngsim, openacc, pair, plain, tidy, ultra_av
 from idm_env.data.errors import DataError, Repair, listed, missing_column, nearest
 from idm_env.data.names import Columns, check_columns, renamed, unread
 from idm_env.data.schema import TIDY
@@ -161,8 +161,9 @@ def batches(
         for number, table in enumerate(_pieces(path, extension, written)):
             names = [name.strip().lower() for name in table.columns]
             explain_each_other = ngsim.matches(names) and ("location" in names or "frame_id" not in names)
-            if number == 0 and columns is None and (explain_each_other or drones.layout_of(table.columns)):
-                yield read(path, layout=layout)
+            whole = columns is None and (explain_each_other or drones.layout_of(table.columns))
+            if number == 0 and (whole or pair.matches(columns)):
+                yield read(path, layout=layout, columns=columns)
                 return
             frame, repairs = _plain_layout(table, layout, path.name, columns)
             yield frame, [*(() if number else REPAIRS.get(path, ())), *repairs]
@@ -226,7 +227,7 @@ def _plain_layout(
 ) -> tuple[pl.DataFrame, list[Repair]]:
     table = _once(table, source)
     if columns is not None:
-        table, named = renamed(table, columns, source)
+        table, named = (pair.read if pair.matches(columns) else renamed)(table, columns, source)
         frame, repairs = tidy.read(table)
         return frame, [*named, *repairs]
     if layout == "ultra_av" or (layout == "auto" and ultra_av.matches(table.columns)):

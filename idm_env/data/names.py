@@ -36,6 +36,16 @@ GUESSES = {
     "gap_m": r"gap|space_?gap|spacing|net_distance",
 }
 """What a column is perhaps called that has no tidy name."""
+_X, _V, _SENSOR = r"(x|s|y|pos|position|loc|local_?y)", r"(v|vel|velocity|spd|speed)", r"(radar|lidar|sensor)?_?"
+_WHO = {"follower": r"(f|fv|sv|fav|fol|foll|follower|following|ego|own|host|subject|self)",
+        "leader": r"(l|lv|pv|lead|leader|leading|preceding|front|target)"}  # fmt: skip
+PAIRS = {
+    **{f"{who}.{name}": rf"{what}_?{of}|{of}_?{what}" for who, of in _WHO.items()
+       for name, what in (("position_m", _X), ("speed_mps", _V), ("length_m", "(l|len|length)"))},
+    "gap_m": rf"{_SENSOR}(range|gap|dist|distance|spacing|space_?gap|clearance)(_?x)?",
+    "range_rate_mps": rf"{_SENSOR}(range_?rate|rel(ative)?_?{_V}|delta_?v|dv)",
+}  # fmt: skip
+"""The same of a table in which a row holds a follower and its leader."""
 
 Columns = Mapping[str, str] | str | None
 """``"time_s=t,position_m=x[ft]"``, or the same as a mapping from the tidy name to the file's."""
@@ -147,6 +157,8 @@ def guessed(columns: list[str]) -> str:
 
     One of two coordinates is never proposed as a position along the road, nor a frame as a time without its rate.
     """
+    if option := _pair(columns):
+        return f"--pair {shlex.quote(option)}"
     guesses: dict[str, str] = {}
     remarks = []
     plane = is_plane(columns)
@@ -168,6 +180,26 @@ def guessed(columns: list[str]) -> str:
         remarks.append(f". {frame} counts pictures: [0.04] is right for 25 a second, else give 1/rate")
     option = ",".join(f"{name}={column}" for name, column in guesses.items())
     return f"--columns {shlex.quote(option)}{''.join(remarks)}"
+
+
+def _pair(columns: list[str]) -> str:
+    """Return the option ``--pair`` for a table of followers and leaders in one row; nothing for other tables."""
+    patterns = {"time_s": GUESSES["time_s"], "run_id": GUESSES["run_id"], **PAIRS}
+    likely = {
+        name: guess
+        for name, pattern in patterns.items()
+        if (guess := next((g for column in columns if (g := _like(name, pattern, column))), None))
+    }
+    if "follower.position_m" not in likely and "follower.speed_mps" not in likely and "gap_m" in likely:
+        own = next((g for c in columns if (g := _like("speed_mps", rf"(veh|vehicle|can)?_?{_V}", c))), None)
+        likely |= {"follower.speed_mps": own} if own else {}
+    if "leader.position_m" in likely and (length := next((c for c in columns if re.fullmatch(r"len(gth)?", c)), None)):
+        likely.setdefault("leader.length_m", length)
+    has = likely.keys()
+    both = has & {"follower.position_m", "follower.speed_mps"} and has & {"leader.position_m", "gap_m"}
+    if not both or "time_s" not in has or any(_like("vehicle_id", GUESSES["vehicle_id"], c) for c in columns):
+        return ""
+    return ",".join(f"{name}={column}" for name, column in likely.items())
 
 
 def is_plane(columns: list[str]) -> bool:
@@ -194,8 +226,9 @@ def _plain(column: str) -> str:
 def _like(name: str, pattern: str, column: str) -> str | None:
     """Return a column with its unit, if it may be what ``name`` wants."""
     plain = _plain(column)
-    unit = next((u for u in UNITS.get(name, {}) if plain.endswith(f"_{u}")), None)
+    units = UNITS.get("speed_mps" if name == "range_rate_mps" else name.rpartition(".")[2], {})
+    unit = next((u for u in units if plain.endswith(f"_{u}")), None)
     stem = plain.removesuffix(f"_{unit}") if unit else plain
     if not stem or not re.fullmatch(pattern, stem):
         return None
-    return f"{column}[{unit}]" if unit and UNITS[name][unit] != 1.0 else column
+    return f"{column}[{unit}]" if unit and units[unit] != 1.0 else column

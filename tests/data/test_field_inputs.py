@@ -148,7 +148,11 @@ def test_no_measured_file_is_alarmed_about(measured: Callable[[str], Path]) -> N
         "transfollower_ngsim_pairs.parquet",
     ]  # fmt: skip
     for name in names:
-        assert not kinds(load(measured(name)).repairs).keys() & {"position jumps", "track split"}, name
+        assert not kinds(load(measured(name)).repairs).keys() & {
+            "position jumps",
+            "track split",
+            "one vehicle overlaps",
+        }, name
 
 
 FCD = pl.DataFrame({
@@ -371,3 +375,71 @@ def test_vehicle_records_of_vissim_are_read(tmp_path: Path) -> None:
     assert leaders(found) == {("1", None), ("2", "1"), ("3", "2")} and found.runs() == ["7"]
     assert np.allclose(found.table["gap_m"].drop_nulls(), 25.0)
     assert abs(found.table["speed_mps"].max() - 12.0) < 1e-6  # type: ignore[operator]
+
+
+WIDE = pl.DataFrame({
+    "t": TIMES, "x_l": 200 + WAY, "x_f": 170 + WAY, "v_l": 3.6 * SPEED, "v_f": 3.6 * SPEED, "len": 5.0,
+    "range": 25.0, "rate": 0.0, "trip": "a",
+})  # fmt: skip
+PAIRED = {
+    "both positions": "follower.position_m=x_f,leader.position_m=x_l,leader.length_m=len",
+    "both speeds as well": "follower.position_m=x_f,leader.position_m=x_l,leader.length_m=len,"
+    "follower.speed_mps=v_f[km/h],leader.speed_mps=v_l[km/h]",
+    "own position and gap": "follower.position_m=x_f,gap_m=range,run_id=trip",
+    "own speed, range and range rate": "follower.speed_mps=v_f[km/h],gap_m=range,range_rate_mps=rate",
+    "own speed and leader's position": "follower.speed_mps=v_f[km/h],leader.position_m=x_l,gap_m=range",
+}
+
+
+@pytest.mark.parametrize("name", PAIRED)
+def test_leader_and_follower_in_one_row_are_read_by_one_option(name: str, tmp_path: Path) -> None:
+    WIDE.write_csv(tmp_path / "a.csv")
+    found = read_alike(tmp_path / "a.csv", tmp_path, f"time_s=t,{PAIRED[name]}").table
+    assert set(found.select("vehicle_id", "leader_id").rows()) == {("follower", "leader"), ("leader", None)}
+    assert np.allclose(found["gap_m"].drop_nulls(), 25.0) and found["gap_m"].null_count() == 6
+    own = found.filter(pl.col("vehicle_id") == "follower")
+    assert np.allclose(own["position_m"] - own["position_m"][0], WAY, atol=1e-9)
+    if "speed_mps" in PAIRED[name]:
+        assert np.allclose(own["speed_mps"], SPEED) and np.allclose(found["speed_mps"].max(), SPEED[-1], atol=0.3)  # type: ignore[arg-type]
+
+
+def test_nobody_in_the_radar_is_no_leader_and_a_target_has_its_name(tmp_path: Path) -> None:
+    seen = WIDE.with_columns(range=pl.Series([25.0, 25, 25, 0, 0, 0]), target=pl.Series([1, 1, 1, 2, 2, 2]))
+    seen.write_csv(tmp_path / "a.csv")
+    pair = "time_s=t,follower.speed_mps=v_f[km/h],gap_m=range,leader.vehicle_id=target"
+    found = read_alike(tmp_path / "a.csv", tmp_path, pair)
+    assert kinds(found.repairs)["nobody ahead"] == 3
+    assert leaders(found) == {("follower", "1"), ("follower", None), ("1", None)}
+
+
+HEADERS = {
+    "t,x_l,x_f,v_l,v_f,length": {"follower.position_m=x_f", "leader.position_m=x_l", "leader.length_m=length"},
+    "Time,VehSpd_kph,RadarRange_m,RangeRate_mps": {"follower.speed_mps=VehSpd_kph[kph]", "gap_m=RadarRange_m"},
+    "t,ego_speed,lead_speed,gap": {"follower.speed_mps=ego_speed", "leader.speed_mps=lead_speed", "gap_m=gap"},
+    "timestamp,FV_position,LV_position,trip_id": {"run_id=trip_id", "leader.position_m=LV_position"},
+}
+
+
+@pytest.mark.parametrize("header", HEADERS)
+def test_the_option_for_a_pair_is_printed_as_it_is_needed(header: str, tmp_path: Path) -> None:
+    rows = [[0.5 * i, *(30.0 + 5 * i + n for n in range(header.count(",")))] for i in range(9)]
+    (tmp_path / "a.csv").write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    told = refused(tmp_path / "a.csv", tmp_path)
+    option = told.partition("--pair ")[2].strip("'")
+    assert HEADERS[header] <= set(option.split(",")), told
+    assert read(tmp_path / "a.csv", columns=option)[0].height == 18
+
+
+@pytest.mark.parametrize(
+    ("pair", "words"),
+    [
+        ("time_s=t,follower.position_m=x_f", "names none of leader.position_m and gap_m"),
+        ("time_s=t,leader.position_m=x_l", "names none of follower.position_m and follower.speed_mps"),
+        ("time_s=t,follower.positon_m=x_f", "did you mean follower.position_m?"),
+        ("time_s=t,follower.position_m=x_g,gap_m=range", "no column 'x_g'"),
+        ("time_s=t,follower.position_m=x_f[mph],gap_m=range", "has the unit 'mph'"),
+    ],
+)
+def test_half_a_pair_is_refused(pair: str, words: str, tmp_path: Path) -> None:
+    WIDE.write_csv(tmp_path / "a.csv")
+    assert words in refused(tmp_path / "a.csv", tmp_path, pair)
