@@ -74,16 +74,15 @@ def scores(
     return rows
 
 
-def sentence(rows: Sequence[Mapping[str, Any]], name: str | None, drivers: int) -> str:
-    """Return what the longest forecasts of the model ``name`` and of no drift score, "" where there are none."""
+def sentence(rows: Sequence[Mapping[str, Any]], name: str | None, drivers: int) -> tuple[str, str]:
+    """Return the model with the best longest forecasts and what they score beside ``name`` and no drift; "" of none."""
     last = {row["model"]: row for row in rows if row["ahead_s"] == HORIZONS_S[-1]}
     if not last:
-        return ""
-    steady, own = last["no drift"], last[name or "no drift"]
-    with_drift = f"{own['gap_crps_m']:.2f} m with {name} and " if name else ""
+        return "", ""
     least = min(last.values(), key=lambda row: row["gap_crps_m"])
-    better = f" {least['model']} forecasts better, {least['gap_crps_m']:.2f} m." if least is not own else ""
-    return (
-        f"On {drivers} drivers kept back the CRPS of the gap {HORIZONS_S[-1]:.0f} s ahead is {with_drift}"
-        f"{steady['gap_crps_m']:.2f} m without drift; the 90 % band holds {own['in_90_percent']:.0f} %.{better}"
+    shown = [least, *(last[n] for n in dict.fromkeys((name, "no drift")) if n and n != least["model"])]
+    scores = ", ".join(f"{row['gap_crps_m']:.2f} m with {row['model']}" for row in shown)
+    return least["model"], (
+        f"{least['model'].capitalize()} forecasts best: on {drivers} drivers kept back the CRPS of the gap "
+        f"{HORIZONS_S[-1]:.0f} s ahead is {scores}; the 90 % band of the first holds {least['in_90_percent']:.0f} %."
     )

@@ -70,7 +70,8 @@ def drift_file(
         progress("kept back", 0, 0, f"{len(rest)} drivers")
         sorts = {"no drift": answer.steady} | {name: e for name, e in answer.found.items() if not e.why_not}
         scores = held_out.scores(sorts, back[0], back[1]) if len(rest) and answer.verdict != "cannot_tell" else []
-        foreseen = held_out.sentence(scores, next(iter(answer.one_of), None), len(rest))
+        foremost, foreseen = held_out.sentence(scores, next(iter(answer.one_of), None), len(rest))
+        best = sorts.get(foremost, best)
         marked = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in fitted[0]])
         save_model(out / "model.yaml", replace(model_of(best), fitted_on=marked))
         result = {
@@ -78,7 +79,7 @@ def drift_file(
             "command": page.command_line(),
             "verdict": answer.verdict,
             "one_of": list(answer.one_of),
-            "sentence": f"{sentence(answer)} {foreseen}".rstrip(),
+            "sentence": f"{foreseen} {sentence(answer)}".lstrip(),
             "sorts": _sorts(answer),
             "kept_back": {"drivers": len(rest), "scores": scores},
             "estimates": {
