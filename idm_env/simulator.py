@@ -14,7 +14,7 @@ from torch.utils.checkpoint import checkpoint
 
 from idm_env import backends, compat, parameters
 from idm_env.multilane import before
-from idm_env.step import INTEGRATORS, CarFollowingStep, Integration, ballistic, euler, half_ahead, normals
+from idm_env.step import INTEGRATORS, CarFollowingStep, Integration, normals
 from idm_env.types import Inputs, Params, State, mapped
 
 
@@ -237,14 +237,4 @@ def _unbind(value: Any) -> list[Any]:
     return [type(value)(*row) for row in zip(*columns, strict=True)]
 
 
-__all__ = [
-    "INTEGRATORS",
-    "Compiled",
-    "Integration",
-    "Simulator",
-    "Trajectory",
-    "ballistic",
-    "euler",
-    "half_ahead",
-    "stacked",
-]
+__all__ = ["INTEGRATORS", "Compiled", "Integration", "Simulator", "Trajectory", "stacked"]

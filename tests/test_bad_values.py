@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import signal
 import subprocess
@@ -209,6 +210,74 @@ def test_too_many_environments_are_refused_with_the_memory_that_they_would_take(
     for count in (10**9, 10**15):
         with pytest.raises(ValueError, match=rf"num_envs = {count} would take about [\d,]+ GB, and cpu has"):
             gym.make_vec("DiffIDM-v0", num_envs=count)
+
+
+def test_a_window_that_no_memory_holds_is_refused_before_its_first_step() -> None:
+    env = gym.make("DiffIDM-v0", output="torch", warmup=0).unwrapped
+    env.reset(seed=0)
+    before = env.state
+    with pytest.raises(ValueError, match=r"steps = 1000000000 would take about [\d,]+ GB, and cpu has .* at most \d+"):
+        env.unroll(lambda seen: pytest.fail("a step was made"), 10**9)
+    with pytest.raises(ValueError, match="must be at most 1000000000"):
+        env.unroll(lambda seen: pytest.fail("a step was made"), 10**400)
+    assert torch.equal(env.state.position, before.position)
+
+
+@pytest.mark.parametrize(
+    "given", [{"task": "highway", "vehicles": 1}, {"task": "merge", "trips": [{"depart": 1.0, "lane": 1}]}]
+)
+def test_a_vehicle_alone_sees_nobody(given: dict[str, Any]) -> None:
+    env = gym.make("DiffIDM-v0", output="torch", **given).unwrapped
+    seen, _ = env.reset(seed=0)
+    for _ in range(3):
+        seen = env.step(env.action_space.sample())[0]
+    named = env.task.by_name(seen)
+    nearby = [x for name, x in named.items() if name.endswith(("_0", "_1"))]
+    assert len(nearby) == 8 and not any(bool(x.any()) for x in nearby), named
+
+
+def test_what_is_empty_or_false_is_no_default() -> None:
+    for name in ("task", "output", "device", "dtype", "autoreset_mode", "parameters", "randomise"):
+        for value in ("", 0, [], False):
+            with pytest.raises(ValueError, match=r"\A[^\n]{1,300}\Z"):
+                gym.make("DiffIDM-v0", **{"disable_env_checker": True, name: value})
+
+
+def test_without_its_compiler_steps_go_on_and_loops_say_so(data: Path) -> None:
+    """NUMBA_DISABLE_JIT: torch steps after one warning, and commands that are loops end in one line."""
+    code = (
+        "import sys, gymnasium as gym, idm_env\n"
+        "env = gym.make('DiffIDM-v0', warmup=0); env.reset(seed=0)\n"
+        "for _ in range(2): env.step(env.action_space.sample())\n"
+        "from idm_env.cli import commands as cli; cli.run()"
+    )
+    switched_off = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code, "filter", str(data), "--out", str(data.parent / "off")],
+        env=switched_off, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    lines = done.stderr.splitlines()
+    assert done.returncode == 1 and sum("the torch path runs" in line for line in lines) == 1, done.stderr
+    assert lines[-1] == "error: loops cannot be compiled while NUMBA_DISABLE_JIT is set. Unset it."
+
+
+def test_lack_of_memory_is_a_sentence(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def lacks(**_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(cli, "app", lacks)
+    with pytest.raises(SystemExit):
+        cli.run()
+    assert capsys.readouterr().err == "error: this needs more memory than there is\n"
+
+
+def test_a_packed_file_without_a_line_is_refused_by_its_size(tmp_path: Path) -> None:
+    """As one of zeros, of which a megabyte holds a gigabyte, or of a picture: not unpacked as a whole."""
+    path = tmp_path / "a.csv.gz"
+    path.write_bytes(gzip.compress(b"\0" * 10_000_001, 1))
+    for command in ("fit", "filter"):
+        said = refused(command, path, "--out", tmp_path / "out")
+        assert "has a line of more than 10000000 characters; it is no table of rows" in said
 
 
 def test_unknown_reset_options_are_refused() -> None:

@@ -678,7 +678,8 @@ def run() -> None:
 
 def _failed(error: Exception) -> NoReturn:
     """End with one line that says what is wrong, never longer than a terminal can take."""
-    reason = storage.full(error) or str(error) or type(error).__name__
+    short = "this needs more memory than there is" if isinstance(error, MemoryError) else type(error).__name__
+    reason = storage.full(error) or str(error) or short
     text = " ".join(" ".join([reason, *getattr(error, "__notes__", ())]).split())
     print(f"error: {text if len(text) <= 1000 else text[:1000] + ' …'}", file=sys.stderr)
     sys.exit(1)

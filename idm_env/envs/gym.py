@@ -15,7 +15,7 @@ from torch import Tensor
 from idm_env import compat
 from idm_env.envs.batch import Batch
 from idm_env.envs.info import begun, single
-from idm_env.envs.settings import RENDER_MODES, Settings, reset_options, settings
+from idm_env.envs.settings import RENDER_MODES, Settings, affordable, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, observation_box
 from idm_env.envs.unrolled import Unrolled, unroll
 from idm_env.tasks import Task
@@ -142,8 +142,9 @@ class Face(Pictures):
 
         Raises:
             RuntimeError: Before the first reset.
-            ValueError: For steps below 1, numpy output, ``hidden`` of other rows, and a policy whose actions or hidden
-                numbers are not finite or of another shape; with a compiled policy nothing has changed then.
+            ValueError: For steps below 1 or beyond the memory, numpy output, ``hidden`` of other rows, and a policy
+                whose actions or hidden numbers are not finite or of another shape; with a compiled policy nothing has
+                changed then.
         """
         if not self.batch.begun:
             raise RuntimeError("unroll was called before reset. Call reset() first.")
@@ -154,7 +155,8 @@ class Face(Pictures):
             raise ValueError(
                 f"autoreset_mode = '{mode.value}': unroll begins anew within the step. Make it with 'SameStep'."
             )
-        return unroll(self.batch, policy, whole("steps", steps, 1), push, hidden)
+        affordable(self.batch.settings, self.batch.count, whole("steps", steps, 1, 10**9))
+        return unroll(self.batch, policy, steps, push, hidden)
 
     def detach(self) -> None:
         """Cut the graph behind the present states, for truncated back-propagation."""

@@ -150,18 +150,20 @@ def reset_options(options: Any, known: tuple[str, ...]) -> dict[str, Any]:
     return options
 
 
-def affordable(made: Settings, count: int) -> None:
-    """Raise ValueError where ``count`` environments would need more memory than the device has."""
+def affordable(made: Settings, count: int, steps: int = 0) -> None:
+    """Raise ValueError where environments, or a window of steps that keeps their worlds, exceed the device's memory."""
     task, size = made.task, made.dtype.itemsize
     features = len(task.bounds.names) * len(task.agents)
-    needed = count * (size * (TENSORS * task.vehicles + SPACES * (features + task.pairs)) + ROW_BYTES)
+    worlds = TENSORS * task.vehicles + SPACES * (features + task.pairs) + steps * (4 * task.vehicles + 3 * features)
+    needed = count * (size * worlds + ROW_BYTES)
     if made.device.type == "cuda":
         memory = torch.cuda.get_device_properties(made.device).total_memory
     else:
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else sys.maxsize
     if needed > memory:
         what = f"num_envs = {count}" if count > 1 else f"vehicles = {task.vehicles} with {len(task.agents)} agents"
-        most = int(count * memory / needed / 2)
+        what = f"steps = {steps}" if steps else what
+        most = int((steps or count) * memory / needed / 2)
         raise ValueError(
             f"{what} would take about {needed / 1e9:,.0f} GB, and {made.device} has {memory / 1e9:,.0f} GB. "
             f"Take {f'at most {most}' if most else 'fewer vehicles or agents'}."

@@ -9,9 +9,16 @@ digests of their text, so nothing has to be deleted after an edit.
 
 from __future__ import annotations
 
+import os
+import warnings
+from functools import cache
 from importlib.util import find_spec
 
 
+@cache
 def available() -> bool:
-    """Return whether numba is installed (``pip install 'idm-env[kernels]'``)."""
-    return find_spec("numba") is not None
+    """Return whether numba is installed (``pip install 'idm-env[kernels]'``) and may compile; else warn once."""
+    may_compile = os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")
+    if not may_compile:
+        warnings.warn("no compiled step, the torch path runs instead: NUMBA_DISABLE_JIT is set.", stacklevel=2)
+    return may_compile and find_spec("numba") is not None

@@ -23,6 +23,8 @@ with needed("a compiled loop"):
     from numba import types
     from numba.core import cgutils
     from numba.extending import intrinsic
+if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+    raise ImportError("loops cannot be compiled while NUMBA_DISABLE_JIT is set. Unset it.")
 
 Place = tuple[str, str]
 STORE = MachineCode()

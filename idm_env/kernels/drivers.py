@@ -336,9 +336,7 @@ class BehindRecord:
         normal = pairs.new_empty(many, many, entries)
         normal[first, second] = pairs
         normal[second, first] = pairs
-        return (
-            cost.view(shape), gradient.T.reshape(*shape, many), normal.permute(2, 0, 1).reshape(*shape, many, many)
-        )  # fmt: skip
+        return (cost.view(shape), gradient.T.reshape(*shape, many), normal.permute(2, 0, 1).reshape(*shape, many, many))
 
     def _linear(
         self, state: State, params: Params, names: tuple[str, ...], start_by: Tensor | None, every: int

@@ -362,10 +362,8 @@ def _differentiable(
     pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if s is not None]
     leaves = [x for x in saved if x.requires_grad]
     gradients = iter(
-        torch.autograd.grad(
-            [o for o, _ in pairs], leaves, [s for _, s in pairs], create_graph=True, allow_unused=True
-        )
-    )  # fmt: skip
+        torch.autograd.grad([o for o, _ in pairs], leaves, [s for _, s in pairs], create_graph=True, allow_unused=True)
+    )
     return [next(gradients) if x.requires_grad else None for x in saved]
 
 

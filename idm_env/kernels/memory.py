@@ -121,9 +121,7 @@ def add(typing_context: Any, target: Any, to: Any, source: Any, at: Any, n: Any)
 
 
 @intrinsic
-def gather(
-    typing_context: Any, target: Any, to: Any, source: Any, at: Any, index: Any, first: Any, n: Any
-) -> Any:  # fmt: skip
+def gather(typing_context: Any, target: Any, to: Any, source: Any, at: Any, index: Any, first: Any, n: Any) -> Any:
     """Copy ``n`` numbers from a place to another: those at ``at`` and the places from ``index[first]`` on."""
     kind = _number(target, source)
 

@@ -123,15 +123,11 @@ def laid_by(order, begin, rows, n, count, halo, wide, slots, own, led, leads):
 
 
 @exact
-def laid(
-    leader, follower, lane, position, present, coming, which, n, count, ring, halo, wide, slots, own, led, leads
-):  # fmt: skip
+def laid(leader, follower, lane, position, present, coming, which, n, count, ring, halo, wide, slots, own, led, leads):
     """Lay some rows out by their links; False where links are not the order of positions."""
     order, begin, place = np.empty(n, np.int64), np.empty(count + 1, np.int64), np.empty(n)
     for row in which:
-        if not walk(
-            leader, follower, lane, position, present, coming, n, count, ring, row * n, order, begin, place
-        ):  # fmt: skip
+        if not walk(leader, follower, lane, position, present, coming, n, count, ring, row * n, order, begin, place):
             return False
         lay(order, begin, n, count, halo, wide, row * n, row * wide, slots, own, led, leads)
     return True

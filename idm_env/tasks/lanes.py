@@ -185,7 +185,7 @@ class LanesTask(Task):
         Each ``(…, seen, agents)``, 0 for nobody.
         """
         assert state.lanes is not None
-        agents, count = len(self.agents), min(self.seen, self.vehicles - 1)
+        agents, count = len(self.agents), min(self.seen, max(1, self.vehicles - 1))  # alone: himself, far away
         own = self.constant("agents", self.agents, state.speed.device, torch.int64)
         lane, position = state.lanes.lane.to(state.speed.dtype), state.position.detach()
         away = self.apart(position.unsqueeze(-2) - self.pick(position).unsqueeze(-1)).abs()
@@ -194,7 +194,7 @@ class LanesTask(Task):
             away = torch.where(both > 0, away, torch.inf)
         away = away.scatter(-1, own.view(-1, 1).expand(*away.shape[:-1], 1), torch.inf)
         # Of two that are equally near the one in the first slot comes first, however that is computed.
-        near = away.sort(dim=-1, stable=True).indices[..., :count]
+        near = away.sort(dim=-1, stable=True).indices[..., :count] if self.vehicles > 1 else own.expand_as(away)
         # Vehicles are picked from the state itself: gradients then flow to them, and to no matrix of all pairs.
         which = torch.cat([near[..., k] for k in range(count)], -1)
 
