@@ -26,6 +26,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -291,9 +292,9 @@ def _check_keys(content: Mapping[str, Any], names: Iterable[str], what: str) -> 
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """Return the mapping of a YAML file; ValueError, in one line, for everything else, whatever its bytes."""
     yaml = _yaml()
+    if not isinstance(path, str | Path) or not os.path.isfile(path):
+        raise ValueError(f"{' '.join(str(path).split())[:200]} is not a file. Give the path of a YAML file.")
     file = Path(path)
-    if not file.is_file():
-        raise ValueError(f"{path} is not a file. Give the path of a YAML file.")
     if file.stat().st_size > MOST_BYTES:
         raise ValueError(f"{path} has {file.stat().st_size} bytes, and {MOST_BYTES} are the most. Is it a YAML file?")
     try:

@@ -22,6 +22,7 @@ from torch.distributions.transforms import Transform
 
 from idm_env.types import Params
 from idm_env.validation import nearest as nearest
+from idm_env.validation import one_of as one_of
 from idm_env.validation import shown
 
 Role = Literal["strength", "shape", "threshold", "place"]
@@ -150,6 +151,8 @@ def check(effects: Iterable[HasParameters], params: Params) -> None:
     effects = tuple(effects)
     declared = catalogue(effects)
     names = {e.name for e in effects}
+    if not isinstance(params, Mapping) or not all(isinstance(part, Mapping) for part in params.values()):
+        raise ValueError(f"parameters = {shown(params)} must be effect → name → tensor, as simulator.defaults() gives.")
     for effect, values in params.items():
         if effect not in names:
             raise ValueError(f"unknown effect {shown(effect)} in parameters.{nearest(effect, names)}")

@@ -67,9 +67,7 @@ class CarFollowingStep:
         sideways = next((e.name for e in self.effects if e.hook == "change"), None)
         if sideways and not self.road.beside:
             raise ValueError(f"effect '{sideways}' changes lanes, and this road has one. Take Lanes(2), or none.")
-        if self.integration not in INTEGRATORS:
-            hint = parameters.nearest(self.integration, INTEGRATORS)
-            raise ValueError(f"integration = '{self.integration}' is unknown.{hint}")
+        parameters.one_of("integration", self.integration, INTEGRATORS)
         if self.decides_in_blocks and self.sees_mergers:
             raise ValueError("who takes turns to decide does not see who signals: leave stagger or that effect out.")
         longest = next((p.high for p in self._following.parameters if p.name == "time_gap"), float("inf"))

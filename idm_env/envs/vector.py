@@ -46,7 +46,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None, **keywords: Any) -> None:
         own = settings(render_mode=render_mode, **keywords)
-        self.num_envs = whole("num_envs", num_envs, 1)
+        self.num_envs = whole("num_envs", num_envs, 1, 10**18)
         affordable(own, num_envs)
         agents = self._take(own, num_envs)
         self.autoreset_mode = own.autoreset_mode

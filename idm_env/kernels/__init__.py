@@ -14,11 +14,12 @@ import warnings
 from functools import cache
 from importlib.util import find_spec
 
+SWITCHED_OFF = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
+
 
 @cache
 def available() -> bool:
     """Return whether numba is installed (``pip install 'idm-env[kernels]'``) and may compile; else warn once."""
-    may_compile = os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")
-    if not may_compile:
+    if SWITCHED_OFF:
         warnings.warn("no compiled step, the torch path runs instead: NUMBA_DISABLE_JIT is set.", stacklevel=2)
-    return may_compile and find_spec("numba") is not None
+    return not SWITCHED_OFF and find_spec("numba") is not None

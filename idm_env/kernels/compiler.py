@@ -14,6 +14,7 @@ from typing import Any
 
 from idm_env import compat
 from idm_env.extras import needed
+from idm_env.kernels import SWITCHED_OFF
 from idm_env.scalar.library import MachineCode
 
 with needed("a compiled loop"):
@@ -23,7 +24,7 @@ with needed("a compiled loop"):
     from numba import types
     from numba.core import cgutils
     from numba.extending import intrinsic
-if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+if SWITCHED_OFF:
     raise ImportError("loops cannot be compiled while NUMBA_DISABLE_JIT is set. Unset it.")
 
 Place = tuple[str, str]

@@ -78,7 +78,7 @@ def behaviour(
             single = _single(model, drivers)
         chosen, values = list(model.effects), {e: dict(v) for e, v in model.parameters.items()}
         dt = model.dt if dt is None else dt
-        integration = integration or model.integration
+        integration = model.integration if integration is None else integration
     else:
         chosen = list(own)
         for effect in make_effects(effects):
@@ -92,8 +92,8 @@ def behaviour(
     for key, change in nested({} if changes is None else changes).items():
         values.setdefault(key, {}).update(change)
         single = {name: x for name, x in single.items() if name[0] != key or name[1] not in change}
-    step = number("dt", 0.1 if dt is None else dt)
-    return Behaviour(tuple(chosen), values, step, cast(Integration, integration or "ballistic"), single)
+    step, scheme = number("dt", 0.1 if dt is None else dt), "ballistic" if integration is None else integration
+    return Behaviour(tuple(chosen), values, step, cast(Integration, scheme), single)
 
 
 def _single(model: Model, path: str | Path) -> dict[tuple[str, str], tuple[float, ...]]:

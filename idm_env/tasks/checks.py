@@ -29,7 +29,7 @@ class Range(NamedTuple):
 
     def check(self, name: str, value: Any) -> None:
         """Raise ValueError, in one line, for what lies outside or is no such number."""
-        if self.several and isinstance(value, Sequence) and not isinstance(value, str):
+        if self.several and isinstance(value, Sequence) and not isinstance(value, str | bytes):
             for i, one in enumerate(value):
                 at_least(f"{name}[{i}]", one, self.low, self.unit, self.high)
         elif self.whole:
@@ -40,7 +40,7 @@ class Range(NamedTuple):
             at_least(name, value, self.low, self.unit, self.high)
 
 
-FLOW = Range(0.0, 1e5, "vehicles an hour")
+FLOW = Range(1.0, 1e5, "vehicles an hour")
 
 
 class Key(NamedTuple):
@@ -136,7 +136,7 @@ class KeywordError(TypeError, ValueError):
 
 def span(name: str, value: Any, low: float, unit: str, high: float = math.inf) -> tuple[float, float]:
     """Return a range from one number or from ``[lowest, highest]``. ValueError for anything else."""
-    ends = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value, value]
+    ends = list(value) if isinstance(value, Sequence) and not isinstance(value, str | bytes) else [value, value]
     suffix = f" ({unit})" if unit else ""
     if len(ends) != 2:
         raise ValueError(f"{name} = {shown(value)} must be one number or [lowest, highest]{suffix}.")
@@ -154,7 +154,7 @@ def ranges_of(randomise: Mapping[str, Any] | None) -> dict[tuple[str, str], tupl
 
 def two_ends(name: str, value: Any) -> tuple[float, float]:
     """Return the ends of a range ``[lowest, highest]``. ValueError for anything else."""
-    if isinstance(value, str) or not isinstance(value, Sequence):
+    if isinstance(value, str | bytes) or not isinstance(value, Sequence):
         raise ValueError(f"{name} = {shown(value)} must be [lowest, highest].")
     return span(name, value, -math.inf, "")
 
@@ -164,7 +164,7 @@ def limits_of(max_command: Any) -> tuple[float, float]:
 
     ValueError for limits that do not hold 0.
     """
-    if isinstance(max_command, Sequence) and not isinstance(max_command, str):
+    if isinstance(max_command, Sequence) and not isinstance(max_command, str | bytes):
         ends = [finite("max_command", x, "m/s²") for x in max_command]
         if len(ends) != 2 or not (-_STRONGEST <= ends[0] <= -_WEAKEST and _WEAKEST <= ends[1] <= _STRONGEST):
             raise ValueError(
@@ -196,7 +196,7 @@ def agents_of(controlled: Any, vehicles: int, first: int) -> tuple[int, ...]:
     ValueError for vehicles that cannot be controlled, none, or one given twice.
     """
     free = vehicles - first
-    if isinstance(controlled, Sequence) and not isinstance(controlled, str):
+    if isinstance(controlled, Sequence) and not isinstance(controlled, str | bytes):
         chosen = tuple(sorted(whole("controlled", i, 0) for i in controlled))
         if not chosen or len(set(chosen)) < len(chosen):
             raise ValueError(f"controlled = {shown(list(controlled))} must name at least one vehicle, and none twice.")

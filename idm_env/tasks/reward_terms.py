@@ -192,7 +192,8 @@ def weighted(
         ValueError: In one line, for an unknown name, no terms, two of one name, and a weight that is not finite.
     """
     if reward is None or isinstance(reward, str):
-        return Weighted(tuple(named[one_of("reward", reward or next(iter(named)), named)].items()), held)
+        name = next(iter(named)) if reward is None else one_of("reward", reward, named)
+        return Weighted(tuple(named[name].items()), held)
     if not isinstance(reward, Mapping) or not reward:
         raise ValueError(
             'reward must give weights of terms, such as {"speed": 0.2, "effort": -4.0}, or be one of '

@@ -148,7 +148,7 @@ BAD: dict[str, tuple[str, dict[str, Any]]] = {
     "must rise in time": ("merge", {"trips": {"per_hour": {1: [[300, 500], [0, 900]]}}}),
     "limits = {'speed': 20.0} must be a list": ("merge", {"limits": {"speed": 20.0}}),
     "a name = '' must be a text": ("merge", {"classes": {"": {"share": 0.2}}}),
-    "inflow of lane 0 = 0": ("approach", {"inflow": 0.0}),
+    "inflow = 0 vehicles an hour must be at least 1": ("approach", {"inflow": 0.0}),
     "off_ramp = [400.0, 400.0] must be [begin, end] (m)": ("open_highway", {"off_ramp": [400.0, 400.0]}),
     "parameters = [] must be a mapping": ("merge", {"parameters": []}),
 }  # fmt: skip
