@@ -164,19 +164,22 @@ class Tables:
         self.plan, self.layout, self.params = plan, layout, params
         self.recorded = recorded = plan.recorded(params)
         self.still = {**layout.still, **{n: self._array(params[e][p]) for n, (e, p) in recorded.parameters.items()}}
-        groups = *plan.before, *plan.groups("then_")
-        self.ahead = RowTable(recorded.forward, self.still, groups)
+        self.ahead = RowTable(recorded.forward, self.still, (*plan.before, *plan.groups("then_")))
         self._watched = [(own, p, x, x._version) for own in params.values() for p, x in own.items()]
         names = [recorded.parameters[n] for n in recorded.wanted]
         self.wanted = [(i, params[e][p]) for i, (e, p) in enumerate(names)]
         self.room = Room({n: (plan.rows, *recorded.forward.shapes[n]) for n in recorded.told}, recorded.forward.types)
-        self.once = RowTable(recorded.forward, self.still | self.room.arrays, groups)
-        """The table of single steps; ``ahead`` is that of windows."""
 
     def _array(self, x: Tensor) -> Array:
         wide = self.plan.size if _wide(x) else 1
         x = x.detach().to(self.plan.world.state.speed.dtype)
         return np.array(x.expand(self.plan.rows, wide).numpy(), order="C")
+
+    @cached_property
+    def once(self) -> RowTable:
+        """The table of single steps; ``ahead`` is that of windows."""
+        groups = *self.plan.before, *self.plan.groups("then_")
+        return RowTable(self.recorded.forward, self.still | self.room.arrays, groups)
 
     @cached_property
     def back(self) -> RowTable:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -106,9 +107,13 @@ class Room:
             begin = self._sizes.get(kind, 0)
             self._at.append((name, kind, begin * kind.itemsize, shape))
             self._sizes[kind] = begin + math.prod(shape)
-        self._memory = {kind: np.empty(size, kind) for kind, size in self._sizes.items()}
-        self.arrays = self._within(self._memory)
+        self._memory: dict[Any, Array] = {}
+
+    @cached_property
+    def arrays(self) -> dict[str, Array]:
         """Arrays that are filled again and again, by name."""
+        self._memory = {kind: np.empty(size, kind) for kind, size in self._sizes.items()}
+        return self._within(self._memory)
 
     def _within(self, memory: Mapping[Any, Array]) -> dict[str, Array]:
         return {name: np.ndarray(shape, kind, memory[kind], begin) for name, kind, begin, shape in self._at}
