@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import math
 import os
 import signal
 import subprocess
@@ -25,7 +26,9 @@ from idm_env import validation
 from idm_env.cli import commands as cli
 from idm_env.data import synthetic
 from idm_env.envs.pettingzoo import parallel_env
+from idm_env.envs.settings import settings as settings_of
 from idm_env.model_file import load_environment, load_model
+from idm_env.tasks import KeywordError
 from tests.commands import refused, typed
 
 QUICK = settings(max_examples=60)
@@ -234,6 +237,40 @@ def test_a_vehicle_alone_sees_nobody(given: dict[str, Any]) -> None:
     named = env.task.by_name(seen)
     nearby = [x for name, x in named.items() if name.endswith(("_0", "_1"))]
     assert len(nearby) == 8 and not any(bool(x.any()) for x in nearby), named
+
+
+FLAT: tuple[Any, ...] = (math.nan, b"1", [None], {"a": 1}, 10**400, object(), np.array([1.0, 2.0]), "a\nb", 1 + 2j)
+
+
+@pytest.mark.parametrize(
+    "name", ["integration", "effects", "drivers", "config", "trusted", "controlled", "reward", "observation", "info"]
+)
+def test_a_flat_keyword_refuses_what_it_does_not_take(name: str) -> None:
+    """Whatever type it is; what none of them takes, in one line, and not in words of a library."""
+    wrong = []
+    for value in FLAT:
+        try:
+            settings_of(**{name: value})
+            wrong.append((value, "accepted"))
+        except (ValueError, KeywordError) as error:
+            if "\n" in str(error) or len(str(error)) > 400 or "ambiguous" in str(error):
+                wrong.append((value, error))
+        except Exception as error:
+            wrong.append((value, repr(error)))
+    assert not wrong
+
+
+def test_seeds_and_parameters_of_a_wrong_type_are_one_line() -> None:
+    single, turns = gym.make("DiffIDM-v0", warmup=0).unwrapped, parallel_env(warmup=0)
+    for value in (True, 1.5, "1", -1, [1], np.array([1, 2])):
+        for reset in (single.reset, turns.reset):
+            with pytest.raises(ValueError, match=r"^seed = .* must be (a whole number|at least 0)\.$"):
+                reset(seed=value)
+    for reset in (single.reset, turns.reset):
+        reset(seed=np.int64(3))
+    for parameters in (3, [], {"idm": 1}):
+        with pytest.raises(ValueError, match="must be effect → name → tensor"):
+            single.params = parameters
 
 
 def test_what_is_empty_or_false_is_no_default() -> None:

@@ -203,6 +203,7 @@ class DiffIDMEnv(Face, gymnasium.Env):
         """Begin an episode; see the class for ``seed`` and ``options``."""
         chosen = reset_options(options, ("state", *self.task.begins_with))
         self.batch.choose({name: x for name, x in chosen.items() if name in self.task.begins_with})
+        seed = None if seed is None else whole("seed", seed, 0)
         super().reset(seed=seed)
         if seed is not None or not self.batch.begun:
             # Without any seed the one that Gymnasium draws from the operating system is used.

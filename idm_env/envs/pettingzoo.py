@@ -26,6 +26,7 @@ from idm_env.envs.gym import Pictures
 from idm_env.envs.info import ids
 from idm_env.envs.settings import RENDER_MODES, settings
 from idm_env.envs.spaces import action_of, action_space, numpy_dtype, observation_box
+from idm_env.validation import whole
 
 _SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0
 
@@ -92,7 +93,7 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         ``options["state"]`` is a ``State`` to start from. PettingZoo's own tests give others, so these are left aside.
         """
         if seed is not None or not self.batch.begun:
-            self.batch.seed([0], [seeding.np_random(seed)[1]])
+            self.batch.seed([0], [seeding.np_random(None if seed is None else whole("seed", seed, 0))[1]])
         # PettingZoo's own tests set it between episodes.
         self.batch.limit = self.max_cycles
         state = options.get("state") if isinstance(options, dict) else None

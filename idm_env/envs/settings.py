@@ -130,11 +130,9 @@ def _device(value: Any) -> torch.device:
 
 
 def _info(value: Any) -> tuple[str, ...]:
-    if value is None or value == "all":
-        return INFO
-    if value == "none":
-        return ()
     names = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    if value is None or (isinstance(value, str) and value in ("all", "none")):
+        return () if value == "none" else INFO
     return tuple(one_of("info", name, INFO) for name in names)
 
 

@@ -24,7 +24,9 @@ def always() -> None:
 
 @contextmanager
 def trusting(trusted: bool = True) -> Iterator[None]:
-    """Trust the files that are read inside; ``False`` leaves it as it is."""
+    """Trust the files that are read inside; ``False`` leaves it as it is. ValueError for what is neither."""
+    if not isinstance(trusted, bool):
+        raise ValueError(f"trusted is of type {type(trusted).__name__}, and must be True or False.")
     token = _given.set(trusted or _given.get())
     try:
         yield

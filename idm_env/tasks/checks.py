@@ -208,7 +208,7 @@ def agents_of(controlled: Any, vehicles: int, first: int) -> tuple[int, ...]:
     count = count_of(controlled, free)
     if count > free:
         raise ValueError(
-            f"controlled = {count} exceeds the {free} vehicles that can be controlled of {vehicles}. "
+            f"controlled = {shown(count)} exceeds the {free} vehicles that can be controlled of {vehicles}. "
             "Control fewer or take more vehicles."
         )
     return tuple(first + i * free // count for i in range(count))
