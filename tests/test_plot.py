@@ -8,7 +8,7 @@ from PIL import Image
 
 from idm_env.data import synthetic
 from idm_env.plot import animate, edie, fundamental_diagram
-from idm_env.reports.diagrams import Panel, VehicleLine
+from idm_env.reports.diagrams import Panel, VehicleLine, axes_of
 
 
 def uniform(vehicles: int, speed: float, ring: float | None = 200.0) -> Panel:
@@ -47,3 +47,11 @@ def test_a_table_is_drawn_with_units_and_an_animation_moves(tmp_path: Path) -> N
             first = np.asarray(shown.convert("RGB"))
             shown.seek(1)
             assert shown.n_frames >= 3 and (np.asarray(shown.convert("RGB")) != first).any()
+
+
+def test_times_of_all_panels_have_one_origin() -> None:
+    """Of which one lane is used late and for a while only."""
+    late = [VehicleLine("9", 1000.0 + np.arange(20.0), np.arange(20.0), np.ones(20))]
+    drawn = [uniform(3, 4.0), Panel("late", tuple(late), None)]
+    assert {axes_of(panel, drawn)[1][0] for panel in drawn} == {"time (s)"}
+    assert axes_of(drawn[1], drawn[1:])[1][0] == "time − 1000 s (s)"

@@ -341,11 +341,12 @@ def fit(
             result = fit_file(source, options, job.out, **run)
         if sumo is not None and not result["failed"]:
             vtypes.write(sumo, load_model(job.out / "model.yaml"))
-    if result["over_fitting"]:
-        console.print(result["over_fitting"], soft_wrap=True, highlight=False)
+    for words in (result["data"].get("noise"), result["over_fitting"]):
+        if words:
+            console.print(words, soft_wrap=True, highlight=False)
     rows = [{"": "fitted", **result["fit"]}]
     if result["held_out"] is not None:
-        rows.append({"": "held out", **result["held_out"]})
+        rows.append({"": f"held-out {result['held_out']['parts']}", **result["held_out"]})
     answers.show("Errors in free simulation", in_words(rows))
     console.print(result["at_bounds"], soft_wrap=True, highlight=False)
     answers.finished(job.out, result["data"]["account"])

@@ -123,17 +123,19 @@ def _on_bounds(rows: list[dict[str, Any]]) -> list[tuple[str, int]]:
     return sorted(((row["words"], row["on_low"] + row["on_high"]) for row in rows), key=lambda item: -item[1])
 
 
-def over_fitting(rows: list[dict[str, Any]], fitted: float, held_out: float | None, by: str) -> str:
+def over_fitting(
+    rows: list[dict[str, Any]], fitted: float, held_out: float | None, by: str, parts: str = "runs"
+) -> str:
     """Return what over-fitting shows, and what to do; nothing where it does not show.
 
-    It shows in a gap RMSE (m) on held-out runs above 1.5 times that on the fitted ones, and in a parameter that is on
-    its bound for more than a third of several groups.
+    It shows in a gap RMSE (m) on held-out ``parts`` (runs or drivers) above 1.5 times that on the fitted ones, and in a
+    parameter that is on its bound for more than a third of several groups.
     """
     words, on = _on_bounds(rows)[0]
     groups = rows[0]["groups"]
     signs = []
     if held_out is not None and held_out > 1.5 * fitted:
-        signs.append(f"the gap RMSE is {held_out:.2f} m on held-out runs and {fitted:.2f} m on the fitted ones")
+        signs.append(f"the gap RMSE is {held_out:.2f} m on held-out {parts} and {fitted:.2f} m on the fitted ones")
     if groups > 1 and 3 * on > groups:
         signs.append(f"{words} is on its bound for {on} of {groups}")
     if not signs:

@@ -7,13 +7,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import polars as pl
 import torch
 
-from idm_env.data import DataError, Episode, Episodes, Repair, Trajectories
+from idm_env.data import DataError, Episode, Episodes, Repair, Trajectories, noise_sigma
 from idm_env.data.errors import by_kind
 from idm_env.data.fingerprint import Track, marks, seen
 from idm_env.data.folder import FolderSlice, shares, stamp
+from idm_env.data.schema import TRACK
 from idm_env.effects import Brakes, base_named
 from idm_env.fitting import drivers, pictures, pieces
 from idm_env.fitting.batch import Batch
@@ -34,6 +36,9 @@ from idm_env.simulator import Simulator
 FITTED = ("parameters.parquet", "drivers.csv", "model.yaml", "report.json", "report.html")
 SIMULATED = ("simulated.parquet", "report.json", "report.html")
 """What ``fit_file`` and ``simulate_file`` write."""
+NOISY_M, MOST_ROWS = 0.12, 50_000
+"""Noise of a position above which a file is raw (m), and the rows that it is taken from. Of nine files of smoothed
+positions none is above 0.01, and NGSIM's raw ones are at 0.16."""
 MOST_DRIVERS = 10_000
 """Drivers that a model.yaml has of its own, at most; drivers.csv has all."""
 
@@ -120,9 +125,18 @@ def _fit_file(work: _Work) -> dict[str, Any]:
         left_out += lost
     data = {**trajectories.summary(), "left_out": [str(r) for r in chosen.left_out], "episodes": len(chosen)}
     data["account"] = page.account(by_kind(trajectories.repairs), by_kind(left_out))
+    data["noise"] = _noise(trajectories, source.path)
     result = _write(work, joined, held_out, data, marks(trajectories, _drivers(chosen)))
     pooled.parts.remove()
     return result
+
+
+def _noise(trajectories: Trajectories, path: Path) -> str:
+    """Return that positions are raw and what to do first; nothing where their noise is below ``NOISY_M``."""
+    tracks = [p["position_m"].to_numpy() for _, p in trajectories.table.head(MOST_ROWS).group_by(TRACK) if len(p) > 20]
+    sigma = float(np.median([noise_sigma(track) for track in tracks])) if tracks else 0.0
+    words = f"Positions have noise of {sigma:.2f} m (one sample to the next): first idm-env filter {path}."
+    return words if sigma > NOISY_M else ""
 
 
 def _fit_folder(work: _Work) -> dict[str, Any]:
@@ -161,7 +175,11 @@ def _write(
         "failed": failed,
         "at_bounds": drivers.sentence(bounds),
         "over_fitting": drivers.over_fitting(
-            bounds, error["gap_rmse_m"], None if held_out is None else held_out["gap_rmse_m"], options.by
+            bounds,
+            error["gap_rmse_m"],
+            None if held_out is None else held_out["gap_rmse_m"],
+            options.by,
+            "runs" if held_out is None else held_out["parts"],
         ),
         "bounds": bounds,
         "parameters": [],
@@ -207,6 +225,7 @@ def _held_out(
     error, _ = errors(problem, own, own[0, :0])
     return {
         **error.summary(),
+        "parts": "runs" if held.drivers is None else "drivers",
         "runs": held.runs(),
         "groups_not_fitted": len(unseen),
         "left_out": [str(r) for r in items.left_out],
@@ -242,8 +261,8 @@ def _fit_page(result: dict[str, Any], joined: JoinedFit, table: list[dict[str, A
         "simulation behind the measured leader."
     )
     if held is not None:
-        lead += f" On {held['episodes']} episodes held out: {held['gap_rmse_m']:.2f} m."
-    rows = [{"": "fitted", **result["fit"]}] + ([] if held is None else [{"": "held out", **held}])
+        lead += f" On {held['episodes']} episodes of held-out {held['parts']}: {held['gap_rmse_m']:.2f} m."
+    rows = [{"": "fitted", **result["fit"]}] + ([] if held is None else [{"": f"held-out {held['parts']}", **held}])
     figures = joined.pictures
     several = (
         [page.note(f"Pictures are of the first of {len(joined.summaries)} parts.")] if joined.summaries[1:] else []
@@ -252,6 +271,7 @@ def _fit_page(result: dict[str, Any], joined: JoinedFit, table: list[dict[str, A
     return [
         *([page.lead(result["failed"])] if result["failed"] else []),
         page.lead(lead),
+        *([page.lead(result["data"]["noise"])] if result["data"].get("noise") else []),
         *([page.lead(result["over_fitting"])] if result["over_fitting"] else []),
         page.text(result["at_bounds"]),
         page.table(in_words(rows)),

@@ -197,7 +197,7 @@ def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = N
     coloured = None
     stride = _stride(drawn, MOST_DRAWN)
     for axes, panel in zip(grid, drawn, strict=False):
-        (began, first), names = axes_of(panel)
+        (began, first), names = axes_of(panel, drawn)
         for line in panel.lines:
             line = _thinned(line, stride)
             place = line.position if panel.ring_length is None else line.position % panel.ring_length
@@ -235,7 +235,7 @@ def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
     content = {
         "colours": COLOURS.tolist(),
         "fastest": fastest,
-        "panels": [_packed(panel, stride, fastest) for panel in drawn],
+        "panels": [_packed(panel, drawn, stride, fastest) for panel in drawn],
     }
     text = json.dumps(content, ensure_ascii=False).replace("<", "\\u003c")
     fragment = Path(__file__).with_name("space_time.html").read_text(encoding="utf-8").replace("{{ data }}", text)
@@ -245,9 +245,12 @@ def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
     page.write_page(path, title, [page.note(words + thinned), page.html(fragment)])
 
 
-def axes_of(panel: Panel) -> tuple[tuple[float, float], tuple[str, str]]:
-    """Return what is subtracted of times (s) and positions (m), so that axes begin near 0, and the axes' names."""
-    began = far_from_0(_range([line.time for line in panel.lines]))
+def axes_of(panel: Panel, drawn: Sequence[Panel]) -> tuple[tuple[float, float], tuple[str, str]]:
+    """Return what is subtracted of times (s) and positions (m), so that axes begin near 0, and the axes' names.
+
+    Times of all that are ``drawn`` have one origin.
+    """
+    began = far_from_0(_range([line.time for each in drawn for line in each.lines]))
     first = 0.0 if panel.ring_length else far_from_0(_range([line.position for line in panel.lines]))
     place_name = f"{less('position', first, 'm')} (m)" if first else place_label(panel.ring_length)
     return (began, first), (f"{less('time', began, 's')} (s)", place_name)
@@ -272,7 +275,7 @@ def place_label(ring_length: float | None) -> str:
     return "position (m)" if ring_length is None else "position on the ring (m)"
 
 
-def _packed(panel: Panel, stride: int, fastest: float) -> dict[str, Any]:
+def _packed(panel: Panel, together: Sequence[Panel], stride: int, fastest: float) -> dict[str, Any]:
     """Return a panel for the page: numbers as 16 bits of their range in the panel, base64."""
     lines = [_thinned(line, stride) for line in panel.lines]
     places = [x.position if panel.ring_length is None else x.position % panel.ring_length for x in lines]
@@ -285,7 +288,7 @@ def _packed(panel: Panel, stride: int, fastest: float) -> dict[str, Any]:
             "speed": _bits(line.speed, 0.0, fastest),
             "breaks": (np.flatnonzero(~line.whole(panel.ring_length)) + 1).tolist(),
         })  # fmt: skip
-    offsets, names = axes_of(panel)
+    offsets, names = axes_of(panel, together)
     return {
         "title": panel.title, "time": time, "place": place, "vehicles": packed, "offsets": offsets, "names": names,
     }  # fmt: skip

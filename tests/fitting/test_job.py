@@ -106,6 +106,20 @@ def test_fit_says_what_over_fitting_shows_and_what_to_do(
     assert found.startswith(words) and bool(found) == bool(words)
 
 
+def test_raw_positions_are_sent_to_filter_and_parts_have_their_name(file: Path, tmp_path: Path) -> None:
+    table = pl.read_csv(file).filter(pl.col("run_id") == pl.col("run_id").min())
+    noise = pl.Series(np.random.default_rng(0).normal(0.0, 0.2, table.height))
+    table.with_columns(pl.col("position_m") + noise).write_csv(tmp_path / "raw.csv")
+    table.write_csv(tmp_path / "smooth.csv")
+    said = {}
+    for name in ("raw", "smooth"):
+        options = ("--starts", 1, "--by", "all", "--held-out", 0.5, "--out", tmp_path / name)
+        said[name] = typed("fit", tmp_path / f"{name}.csv", *options)
+    assert "Positions have noise of 0.2" in said["raw"].stderr and "first idm-env filter" in said["raw"].stderr
+    assert "noise" not in said["smooth"].stderr and "drivers" in said["smooth"].stdout
+    assert "of held-out drivers: " in (tmp_path / "raw" / "report.html").read_text()
+
+
 def test_simulate_repeats_what_fit_reported(file: Path, tmp_path: Path) -> None:
     """A saved model rolled out behind the same leaders gives the error of its fit."""
     fitted = fit_file(Source(file, smooth=True), Options(starts=1), tmp_path / "fit")
