@@ -317,10 +317,27 @@ def _table(path: Path, extension: str, written: dict[str, Any], skip: int = 0, r
         raise _unreadable(path, error) from None
 
 
+def _odd_line(path: Path) -> str:
+    """Return in words the first line of a text with more cells than its header, or an open quote; "" of none."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        header = file.readline()
+        mark = max(",;\t", key=header.count)
+        cells = header.count(mark) + 1
+        for number, line in enumerate(file, 2):
+            shown = line.strip()[:60]
+            if line.count('"') % 2:
+                return f"line {number} has a quote that does not end: {shown}"
+            if '"' not in line and line.count(mark) >= cells:
+                return f"line {number} has {line.count(mark) + 1} cells, and the header {cells}: {shown}"
+    return ""
+
+
 def _unreadable(path: Path, error: BaseException) -> DataError:
     """Return the error in one line; of what is packed, two libraries would say the same fault in two ways."""
     packed = next((kind for kind in ("parquet", "gz") if path.name.lower().endswith(f".{kind}")), None)
     reason = str(error).strip().splitlines()[0][:150] if str(error).strip() else type(error).__name__
     if packed and not getattr(error, "errno", None):
         reason = f"as {packed}"
+    elif isinstance(error, pl.exceptions.ComputeError) and (line := _odd_line(path)):
+        return DataError(f"{path.name}: {line}. Mend that line.")
     return DataError(f"{path.name} cannot be read ({reason}); is it complete and what its extension says?")

@@ -305,6 +305,16 @@ REFUSED: dict[str, tuple[str, Callable[[Path], object], str]] = {
     ),
     "another xml": ("a.xml", lambda p: p.write_text("<routes><vehicle id='a'/></routes>"), "is XML of <routes>"),
     "half of an xml": ("a.xml", lambda p: p.write_text("<fcd-export><timestep time='0'>"), "is no whole XML"),
+    "more cells": (
+        "a.csv",
+        lambda p: p.write_text(text() + "3,1,2,1,5\n"),
+        "line 20 has 5 cells, and the header 4: 3,1",
+    ),
+    "an open quote": (
+        "a.csv",
+        lambda p: p.write_text(text() + '3,1,"2,1\n'),
+        "line 20 has a quote that does not end: 3",
+    ),
     "no zip": ("a.zip", lambda p: p.write_bytes(b"PK"), "cannot be read"),
 }
 
