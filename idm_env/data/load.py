@@ -269,7 +269,8 @@ def _checked(path: Path) -> tuple[str, list[str], dict[str, Any]]:
         raise DataError(f"{path} does not exist; check the path.")
     extension = next((ending for ending in EXTENSIONS if path.name.lower().endswith(ending)), None)
     if extension is None:
-        raise DataError(f"{path.name} has an unknown extension; use one of {', '.join(EXTENSIONS)}.")
+        cure = "save the sheet as csv" if path.name.lower().endswith((".xlsx", ".xls", ".ods")) else "use one of these"
+        raise DataError(f"{path.name} has an unknown extension; {cure}: {', '.join(EXTENSIONS)}.")
     if path.stat().st_size == 0:
         raise DataError(f"{path.name} is empty (0 bytes); it needs a header and rows.")
     if extension == ".parquet":

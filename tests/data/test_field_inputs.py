@@ -315,6 +315,7 @@ REFUSED: dict[str, tuple[str, Callable[[Path], object], str]] = {
         lambda p: p.write_text(text() + '3,1,"2,1\n'),
         "line 20 has a quote that does not end: 3",
     ),
+    "a sheet": ("a.xlsx", lambda p: p.write_bytes(b"PK"), "save the sheet as csv"),
     "no zip": ("a.zip", lambda p: p.write_bytes(b"PK"), "cannot be read"),
 }
 
