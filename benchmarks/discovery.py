@@ -223,6 +223,8 @@ def measure(job: Job, on_progress: object = None) -> dict[str, Any]:
         "before": report["error"]["before"]["gap_rmse_m"],
         "after": report["error"]["after"]["gap_rmse_m"],
         "floor": report["error"]["floor"]["gap_rmse_m"],
+        "ahead": report["error"]["before"]["horizon_rmse_m"],
+        "ahead_floor": report["error"]["floor"]["horizon_rmse_m"],
         "oracle": oracle(discovery, truth) if truth.effects else None,
         "why": report["reason"],
         "best": next((c["effect"] for c in report["candidates"]), ""),
@@ -247,7 +249,7 @@ def right(row: dict[str, Any]) -> bool:
     """
     if not row["found"]:
         faint = row["oracle"] is not None and row["oracle"] > 0.98 * row["before"]
-        return bool(faint and row["verdict"] in ("none", "cannot_tell"))
+        return bool(faint and row["verdict"] in ("none", "undecided", "cannot_tell"))
     first = row["found"][0]
     return first == row["effect"] or (first in RESPONSE and row["effect"] in RESPONSE)
 
@@ -283,6 +285,8 @@ def shown(rows: list[dict[str, Any]]) -> str:
     lines.append(f"catalogue name for an effect outside it | {share([bool(r['named']) for r in outside_rows])}")
     noticed = [r["verdict"] in ("shape", "located", "unexplained") for r in outside_rows]
     lines.append(f"an effect outside it is noticed | {share(noticed)}")
+    unseen = [r["verdict"] == "none" and r["ahead"] > 3.0 * r["ahead_floor"] for r in rows if r["effect"] != "none"]
+    lines.append(f"none over an effect and three times the sensors' noise | {share(unseen)}")
     both = [set(r["effect"].split("+")) <= set(r["named"]) for r in rows if r["kind"] == "two"]
     lines.append(f"two effects at once, both named | {share(both)}")
     if clean:

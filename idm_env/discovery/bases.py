@@ -163,7 +163,7 @@ def uses(laws: Iterable[Law], chosen: Judged, seed: int) -> list[Use]:
 
 
 def rows(laws: Iterable[Law]) -> list[LawErrors]:
-    """Return what a report says of laws."""
+    """Return the rows of a report's table of laws."""
     return [
         LawErrors(
             each.law.kind, each.title, each.law.equation, list(each.own), each.at_best, **each.errors.summary(),

@@ -19,13 +19,11 @@ from idm_env.discovery import judge
 from idm_env.discovery.closed_loop import ClosedLoopFit
 from idm_env.discovery.records import Records, whole
 from idm_env.discovery.result import Ceilings
-from idm_env.discovery.solve import Problem, Solution, solve
+from idm_env.discovery.solve import Problem, Solution
 
 NEIGHBOURS = 10
 EVERY = 4
 """Every so many samples of 0.5 s of free simulation are compared with matched situations."""
-FEWEST = 5
-"""Drivers from which a correlation between them is told."""
 CORRECTED_S = 10.0
 """Time in which a driver corrects an error of the gap; slow drift adds up over about that long."""
 LAGS_S = (5.0, 20.0)
@@ -40,7 +38,7 @@ def ceilings_of(at: ClosedLoopFit, test: Records, null: Solution, smooth_gain: f
         null: IDM.
         smooth_gain: Of the best smooth function of the state over IDM, in log RMSE in windows of 5 s.
     """
-    values = repeats(at), between_halves(at), refitted(test, null), 1.0 - float(np.exp(-smooth_gain))
+    values = repeats(at), refitted(test, null), 1.0 - float(np.exp(-smooth_gain))
     return Ceilings(*(value if np.isfinite(value) else None for value in values))
 
 
@@ -69,21 +67,6 @@ def repeats(at: ClosedLoopFit) -> float:
         product += float((error[mine] * error[~mine][near].mean(1)).sum())
         square += float((error[mine] ** 2).sum())
     return float("nan") if square == 0.0 else float(np.clip(product / square, 0.0, 1.0))
-
-
-def between_halves(at: ClosedLoopFit) -> float:
-    """Return the correlation, over drivers, of the logarithms of time gaps of both halves of their time."""
-    seen = np.unique(at.problem.rows.group)
-    if len(seen) < FEWEST:
-        return float("nan")
-    rows = at.problem.rows
-    other = replace(at.problem, rows=replace(rows, valid=at.scored))
-    theta = solve(other, at.model.fixed(at.values), at.theta, np.zeros(0), iterations=10, tolerance=1e-4).theta
-    names = [p.name for p in at.model.catalogue.own]
-    if "time_gap" not in names:
-        return float("nan")
-    i = names.index("time_gap")
-    return float(np.corrcoef(at.theta[seen, i], theta[seen, i])[0, 1])
 
 
 def refitted(records: Records, null: Solution) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from idm_env.data import Trajectories
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import bases, ceilings, fleet, found, judge, places, replica, shared, summary
+from idm_env.discovery import bases, ceilings, fleet, found, judge, places, replica, shared, summary, tails
 from idm_env.discovery import model as terms
 from idm_env.discovery.compare import compare
 from idm_env.discovery.judgement import Evaluation, Judgement, judgement_of
@@ -114,8 +114,13 @@ def finished(
         ladder = judgement.climbed(prepared, pooled, floor["horizon_rmse_m"])
         if not (judgement.added or judgement.law or judgement.fleet or judgement.is_exact(least)):
             leading = decided.rounds[0].leading
-            agreements = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
-            ladder = replace(ladder, agreement=agreements[0], leading=None if leading is None else agreements[1])
+            noisy, agreements = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
+            errors = replica.ahead(everywhere[0], everywhere[1].theta, noisy.model)
+            ladder = replace(
+                ladder, agreement=agreements["scene"], tails=agreements["tails"], leading=agreements.get("leading"),
+                worst=tails.worst(everywhere[0].rows, errors),
+                unsteady=(float(np.median(noisy.sigma)), noisy.memory_s),
+            )  # fmt: skip
         judgement = replace(judgement, ladder=ladder)
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
     result = summary.summarise(

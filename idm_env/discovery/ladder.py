@@ -17,6 +17,7 @@ from scipy.stats import t as student
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.records import Records, Rows, windows
 from idm_env.discovery.ridge import FEATURES, Ridge, Smooth, by_group, units, weights
+from idm_env.discovery.tails import Worst
 
 PAST_S = (1.0, 3.0)
 COORDINATES: tuple[tuple[str, str, Callable[[np.ndarray], np.ndarray]], ...] = (
@@ -38,6 +39,9 @@ STRUCTURED = 0.02
 
 The scene tells a part of drivers' noise, too: of six sets without an effect, noise of 0 to 0.2 m/s², up to 0.01.
 """
+
+TAILS, ALIKE = 0.03, 0.2
+"""p-value below which errors lie together (one of 39 replicas is not), and from which on noise looks like them."""
 
 
 @dataclass(frozen=True)
@@ -75,33 +79,57 @@ class Dependence:
 
 
 @dataclass(frozen=True)
+class Share:
+    """A share with its 95 % interval."""
+
+    share: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
 class Ladder:
     """Errors 5 s ahead (m) by rung, the squared error's parts, and the share that is structure with its 95 % interval.
 
+    By rung, where it has them, also the gap's error in closed-loop simulation, 10 s ahead, and the CRPS 5 s ahead (m).
     Parts add up to 1, that is to the squared error of drivers with their own parameters. Drift is what a driver's other
     errors foresee. What is ``not foreseen`` is new in these 5 s, or nothing that a smooth function of the scene tells.
     """
 
-    rungs: dict[str, float]
+    rungs_m: dict[str, float]
+    free_m: dict[str, float]
+    ten_s_m: dict[str, float]
+    crps_m: dict[str, float]
     parts: dict[str, float]
-    structure: tuple[float, float, float]
-    others: dict[str, dict[str, float]]
-    """By rung, where it has them: the gap's error in closed-loop simulation, 10 s ahead, and the CRPS 5 s ahead (m)."""
-
+    structure: Share
     dependences: tuple[Dependence, ...] = ()
     agreement: Agreement | None = None
     """Of what a smooth function of the scene takes, where nothing was added."""
     leading: Agreement | None = None
     """Of what the leading candidate takes, in whitened windows, where one gains beyond chance and nothing was added."""
+    tails: Agreement | None = None
+    """Of the share of the squared error in the worst windows, where nothing was added."""
+    worst: Worst | None = None
+    unsteady: tuple[float, float] | None = None
+    """Noise of the median driver that would explain the errors (m/s²), and its memory (s)."""
 
     @property
     def unnamed(self) -> float:
         """Share that the scene tells, beyond chance and beyond what drivers' noise looks like; 0 if none does."""
-        share, low, _ = self.structure
-        sure = share if low > 0.0 else 0.0
+        sure = self.structure.share if self.structure.low > 0.0 else 0.0
         if self.agreement is not None:
             sure = max(sure, self.agreement.share) if self.agreement.is_refused else 0.0
         return sure if sure > STRUCTURED else 0.0
+
+    @property
+    def is_somewhere(self) -> bool:
+        """Whether errors lie together as noise hardly ever makes them."""
+        return self.tails is not None and self.tails.p_value < TAILS
+
+    @property
+    def agrees(self) -> bool:
+        """Whether noise of drivers looks like the errors in every test, and not only unlike them in none."""
+        return all(one is not None and one.p_value >= ALIKE for one in (self.agreement, self.tails))
 
     @property
     def leads(self) -> bool:
@@ -136,7 +164,7 @@ def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, f
     taken = {
         "sensors": floor_m**2,
         "added": total - _rmse(error) ** 2,
-        "structure without a name": structure[0] * _rmse(error) ** 2,
+        "structure without a name": structure.share * _rmse(error) ** 2,
         "drift": _rmse(error) ** 2 - _rmse(rest) ** 2,
     }
     parts, room = {}, 1.0
@@ -145,13 +173,11 @@ def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, f
         room -= parts[name]
     order = ("sensors", "drift", "added", "structure without a name")
     ahead = {name: judged.ahead for name, judged in models.items()} | left
-    others = {
-        "free_m": {name: judged.summary()["gap_rmse_m"] for name, judged in models.items()},
-        "ten_s_m": {name: _rmse(judged.further) for name, judged in models.items() if len(judged.further)},
-        "crps_m": {name: _crps(rows, what) for name, what in ahead.items()},
-    }
+    free_m = {name: judged.summary()["gap_rmse_m"] for name, judged in models.items()}
+    ten_s_m = {name: _rmse(judged.further) for name, judged in models.items() if len(judged.further)}
+    crps_m = {name: _crps(rows, what) for name, what in ahead.items()}
     parts = {name: parts[name] for name in order} | {"not foreseen": room}
-    return Ladder(rungs, parts, structure, others, dependences(rows, error, seed))
+    return Ladder(rungs, free_m, ten_s_m, crps_m, parts, structure, dependences(rows, error, seed))
 
 
 def _crps(rows: Rows, error: np.ndarray) -> float:
@@ -170,7 +196,7 @@ def _crps(rows: Rows, error: np.ndarray) -> float:
     return float(np.mean(wide * (z * (2.0 * normal.cdf(z) - 1.0) + 2.0 * normal.pdf(z) - np.pi**-0.5)))
 
 
-def structure(rows: Rows, error: np.ndarray, seed: int, features: int) -> tuple[float, float, float]:
+def structure(rows: Rows, error: np.ndarray, seed: int, features: int) -> Share:
     """Return the share of squared errors [W] that a smooth function of the scene takes beside drift, and interval."""
     rest = error - Ridge.fit(rows, error, _drift(rows, error)).predicted
     return _share(rows, rest, rest - _smooth(rows, rest, _scene(rows), seed, features), error)
@@ -243,7 +269,7 @@ def _past(rows: Rows) -> np.ndarray:
     return np.stack(past, axis=1)
 
 
-def _share(rows: Rows, before: np.ndarray, after: np.ndarray, whole: np.ndarray) -> tuple[float, float, float]:
+def _share(rows: Rows, before: np.ndarray, after: np.ndarray, whole: np.ndarray) -> Share:
     """Return the share of the squared error ``whole`` that goes from ``before`` to ``after``, with its 95 % interval.
 
     Every driver counts by ``ridge.weights``; the interval is Student's t over runs, or over drivers of few runs.
@@ -258,7 +284,7 @@ def _share(rows: Rows, before: np.ndarray, after: np.ndarray, whole: np.ndarray)
         if count > 1
         else np.inf
     )
-    return share, float(share - width), float(share + width)
+    return Share(share, float(share - width), float(share + width))
 
 
 def _rmse(error: np.ndarray) -> float:

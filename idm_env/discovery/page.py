@@ -24,6 +24,7 @@ TITLES = {
     Verdict.SHAPE: "What {law} lacks here has a shape, but no name",
     Verdict.LOCATED: "What {law} lacks here has a place, but no name",
     Verdict.UNEXPLAINED: "{law} lacks something here that nothing tried explains",
+    Verdict.UNDECIDED: "What {law} leaves here is drivers' noise, or an effect of a form not tried",
     Verdict.NONE: "Nothing was found that {law} lacks here",
     Verdict.CANNOT_TELL: "These data cannot tell what {law} lacks",
 }

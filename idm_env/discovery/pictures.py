@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import matplotlib
 
@@ -12,12 +12,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from idm_env.discovery import words
+from idm_env.discovery.solve import projected
 from idm_env.effects.free import FEATURES
 
 if TYPE_CHECKING:
     from idm_env.discovery.finish import Discovery
     from idm_env.discovery.judge import Judged
-    from idm_env.discovery.result import Rungs
+    from idm_env.discovery.ladder import Ladder
+    from idm_env.discovery.search import Scored
     from idm_env.discovery.selection import Round
 
 BEFORE, AFTER, TRUTH, GREY = "#c0392b", "#1f6fb2", "#222222", "#9aa5b1"
@@ -45,35 +47,22 @@ def ranking(this: Round) -> Figure:
     return figure
 
 
-def _projected(d: Discovery, scored: Any) -> np.ndarray | None:
+def _projected(scored: Scored) -> np.ndarray | None:
+    """Return the response [R, m] to a candidate's first parameter, of a curve to all, off the drivers' own."""
     solution = scored.solution
     if solution is None or not solution.linear.by_phi.shape[-1]:
         return None
-    linear = solution.linear
     mine = solution.model.where(scored.term.label)
-    if scored.term.size > 4:
-        column = np.einsum("rmq,q->rm", linear.by_phi[..., mine], solution.values[mine])
-    else:
-        column = linear.by_phi[..., mine.start]
-    return _off(d, linear.by_theta, column)
-
-
-def _off(d: Discovery, by_theta: np.ndarray, column: np.ndarray) -> np.ndarray:
-    group = d.problem.rows.group
-    groups = d.problem.groups
-    own = by_theta.shape[-1]
-    matrix, cross = np.zeros((groups, own, own)), np.zeros((groups, own))
-    np.add.at(matrix, group, np.einsum("rmi,rmj->rij", by_theta, by_theta))
-    np.add.at(cross, group, np.einsum("rmi,rm->ri", by_theta, column))
-    follow = np.linalg.solve(matrix + 1e-6 * np.eye(own), cross[..., None])[..., 0]
-    return column - np.einsum("rmi,ri->rm", by_theta, follow[group])
+    weight = solution.values[mine] if scored.term.size > 4 else np.eye(scored.term.size)[0]
+    response: np.ndarray = projected(solution)[..., mine] @ weight
+    return response
 
 
 def look_alikes(d: Discovery) -> Figure | None:
     """Heat map of cosines."""
     names, columns = [], []
     for s in d.rounds[0].scored:
-        column = _projected(d, s) if s.term.effect is not None else None
+        column = _projected(s) if s.term.effect is not None else None
         if column is not None and np.sum(column**2) > 1e-9:
             names.append(words.plain(s.term.label))
             columns.append(column.ravel() / np.sqrt(np.sum(column**2)))
@@ -89,30 +78,6 @@ def look_alikes(d: Discovery) -> Figure | None:
             if i != j and abs(cosine[i, j]) > 0.4:
                 axes.text(j, i, f"{cosine[i, j]:.1f}", ha="center", va="center", fontsize=6)
     figure.colorbar(image, shrink=0.8)
-    return figure
-
-
-def added_variable(d: Discovery) -> Figure | None:
-    """Scatter of the residual against the winner's response, per window."""
-    this = d.rounds[0]
-    if this.winner is None:
-        return None
-    scored = this.scored[this.winner]
-    column = _projected(d, scored)
-    if column is None:
-        return None
-    residual = _off(d, d.null.linear.by_theta, d.problem.residual(
-        d.problem.errors(d.null.theta[None], d.null.model, d.null.values[None])
-    )[0])  # fmt: skip
-    x, y = (column**2).sum(1) ** 0.5 * np.sign(column[:, -1]), -(residual * column).sum(1)
-    y = y / np.maximum((column**2).sum(1) ** 0.5, 1e-9) * np.sign(column[:, -1])
-    figure, axes = plt.subplots(layout="constrained", figsize=(5.4, 3.6))
-    axes.plot(x, y, ".", ms=2.5, color=AFTER, alpha=0.5)
-    slope = float((x * y).sum() / max((x * x).sum(), 1e-12))
-    reach = np.array([x.min(), x.max()])
-    axes.plot(reach, slope * reach, color=BEFORE, lw=1.2)
-    axes.set_xlabel(f"response to {words.plain(scored.term.label)} (in units of noise)")
-    axes.set_ylabel("residual along it")
     return figure
 
 
@@ -137,7 +102,7 @@ def curves(d: Discovery) -> Figure | None:
     return figure
 
 
-def dependences(ladder: Rungs | None) -> Figure | None:
+def dependences(ladder: Ladder | None) -> Figure | None:
     """Mean of what the smooth function of the scene takes off, over each coordinate."""
     if ladder is None or not ladder.dependences:
         return None

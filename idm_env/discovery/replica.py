@@ -17,6 +17,7 @@ from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records, Rows, whole, windows
 from idm_env.discovery.score import held_out, log_gain
 from idm_env.discovery.solve import Population, Problem, Solution, solve
+from idm_env.discovery.tails import concentration
 
 LAGS_S = (0.5, 1.5)
 """Lags at which increments of the speed's error are compared: at these, white noise of sensors is gone."""
@@ -85,13 +86,13 @@ def drivers_of(problem: Problem, solution: Solution, noise_m: float) -> NoisyDri
     if not tried:
         return none
     best = min(tried, key=lambda one: one[0])[1]
-    seen, goal = np.unique(problem.rows.group), np.median(_ahead(problem, solution.theta, model) ** 2)
+    seen, goal = np.unique(problem.rows.group), np.median(ahead(problem, solution.theta, model) ** 2)
     low, high = model.catalogue.bounds.T
     for _ in range(2):
         replica, theta = _fitted(problem, best, np.random.default_rng(0), noise_m)
         off = np.median((theta - best.theta)[seen], axis=0)
         # Increments tell what is drift and its memory; how large it is shows better in what it comes to.
-        scale = np.sqrt(goal / np.median(_ahead(replica, theta, model) ** 2))
+        scale = np.sqrt(goal / np.median(ahead(replica, theta, model) ** 2))
         best = replace(best, theta=np.clip(solution.theta - off, low, high), sigma=best.sigma * scale)
     return best
 
@@ -104,8 +105,8 @@ def _fitted(
     return replica, solve(replica, drivers.model, drivers.theta, EMPTY[0], iterations=3).theta
 
 
-def _ahead(problem: Problem, theta: np.ndarray, model: Hypothesis) -> np.ndarray:
-    """Return errors of the gap 5 s ahead [W]."""
+def ahead(problem: Problem, theta: np.ndarray, model: Hypothesis) -> np.ndarray:
+    """Return errors of the gap 5 s ahead (m) [W] with log θ [G, P]."""
     errors: np.ndarray = Problem(problem.rows, None, problem.prior).errors(theta[None], model, EMPTY)[0][:, -1]
     return errors
 
@@ -129,18 +130,21 @@ def _increments(rows: Rows, model: Hypothesis, theta: np.ndarray) -> tuple[float
 
 def agreement(
     problem: Problem, solution: Solution, noise_m: float, seed: int, term: Term | None = None
-) -> list[ladder.Agreement]:
-    """Return whether a model's errors 5 s ahead agree with noise, by posterior predictive p-values.
+) -> tuple[NoisyDrivers, dict[str, ladder.Agreement]]:
+    """Return a model's drivers with their noise, and whether its errors 5 s ahead agree with that noise.
 
-    The first statistic is the share of the squared error that a smooth function of the scene takes beside drift, as on
-    the ladder with fewer features; the second, of a ``term``, is the share of the whitened squared error that it
-    takes. Every replica has drivers' noise, that of sensors (``noise_m``), and drivers fitted to it in windows of 5 s,
-    as those of ``solution`` are to the data.
+    Posterior predictive p-values: ``scene`` of the share of the squared error that a smooth function of the scene takes
+    beside drift, as on the ladder with fewer features; ``tails`` of that in the worst windows (``tails``); ``leading``,
+    of a ``term``, of the share of the whitened squared error that it takes. Every replica has drivers' noise, that of
+    sensors (``noise_m``), and drivers fitted to it in windows of 5 s, as those of ``solution`` are to the data.
     """
     drivers, random = drivers_of(problem, solution, noise_m), np.random.default_rng(seed)
 
-    def smooth(windowed: Problem, theta: np.ndarray) -> float:
-        return ladder.structure(windowed.rows, _ahead(windowed, theta, drivers.model), seed, FEATURES)[0]
+    def scene(windowed: Problem, theta: np.ndarray) -> float:
+        return ladder.structure(windowed.rows, ahead(windowed, theta, drivers.model), seed, FEATURES).share
+
+    def tail(windowed: Problem, theta: np.ndarray) -> float:
+        return concentration(windowed.rows, ahead(windowed, theta, drivers.model))
 
     def gain(windowed: Problem, theta: np.ndarray) -> float:
         assert term is not None
@@ -150,17 +154,18 @@ def agreement(
         mean = float(log_gain(held_out(windowed, before), held_out(windowed, after)).mean())
         return 1.0 - float(np.exp(-2.0 * mean))
 
-    statistics = [smooth] if term is None else [smooth, gain]
-    mine, above, draws = ([f(problem, solution.theta) for f in statistics], [0, 0], [0, 0])
+    statistics = {"scene": scene, "tails": tail} | ({} if term is None else {"leading": gain})
+    mine = {name: f(problem, solution.theta) for name, f in statistics.items()}
+    above, draws = dict.fromkeys(mine, 0), dict.fromkeys(mine, 0)
     for draw in range(1, DRAWS + 1):
-        if (still := [i for i in range(len(statistics)) if above[i] < ENOUGH]) == []:
+        if not (still := [name for name in mine if above[name] < ENOUGH]):
             break
         replica, theta = _fitted(problem, drivers, random, noise_m)
-        for i in still:
-            above[i] += statistics[i](replica, theta) >= mine[i]
-            draws[i] = draw
-    p = [a / n if a == ENOUGH else (a + 1) / (n + 1) for a, n in zip(above, draws, strict=True)]
-    return [ladder.Agreement(*one) for one in zip(mine, p, draws, strict=False)]
+        for name in still:
+            above[name] += statistics[name](replica, theta) >= mine[name]
+            draws[name] = draw
+    p = {name: a / draws[name] if a == ENOUGH else (a + 1) / (draws[name] + 1) for name, a in above.items()}
+    return drivers, {name: ladder.Agreement(mine[name], p[name], draws[name]) for name in mine}
 
 
 def _no_prior(theta: np.ndarray) -> Population:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from idm_env.discovery.ladder import Agreement, Dependence
+from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.shared import Shared
 
 SCHEMA = 3
@@ -91,30 +91,6 @@ class Change:
     share_of_drivers_improved: float
     trimmed_before: float
     trimmed_after: float
-
-
-@dataclass(frozen=True)
-class Share:
-    """A share with its 95 % interval."""
-
-    share: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
-class Rungs:
-    """Errors by rung (see ``ladder``), in m, and the parts of the squared error 5 s ahead."""
-
-    rungs_m: Errors
-    free_m: Errors
-    ten_s_m: Errors
-    crps_m: Errors
-    parts: dict[str, float]
-    structure: Share
-    dependences: Sequence[Dependence]
-    agreement: Agreement | None = None
-    leading: Agreement | None = None
 
 
 @dataclass(frozen=True)
@@ -243,7 +219,6 @@ class Ceilings:
     """How much could be explained at all (see ``ceilings``), None where these data do not tell."""
 
     repeats_share: float | None
-    time_gap_between_halves: float | None
     refitted_gap_rmse_m: float | None
     smooth_function_gain: float | None
 
@@ -327,7 +302,7 @@ class Result:
     found: list[TermFinding]
     known: list[GivenParameter]
     helps: dict[str, Change]
-    ladder: Rungs | None
+    ladder: Ladder | None
     interval: str | None
     models: dict[str, str]
     error: HeldOutErrors

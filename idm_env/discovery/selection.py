@@ -273,7 +273,9 @@ def _is_small(searching: Search, now: Solution, chosen: Solution) -> bool:
     """
     problem, added = searching.problem, chosen.model.terms[len(now.model.terms) :]
     first = len(added) == 1 and now.model.terms == searching.base.terms
-    if not first and together.is_too_short(chosen, added, problem.rows.records.dt):
+    if first and _is_a_step(chosen, problem.rows.records.dt):
+        return False
+    if together.is_too_short(chosen, added, problem.rows.records.dt):
         return True
     before, after = (problem.errors(s.theta[None], s.model, s.values[None])[0][:, -1] for s in (now, chosen))
     return bool(np.sqrt(np.mean((after - before) ** 2)) < judge.least_m(problem.rows.records))

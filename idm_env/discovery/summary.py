@@ -22,6 +22,9 @@ from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude
 from idm_env.effects import ALL
 from idm_env.reports.page import versions
 
+LARGE = 3.0
+"""Times the sensors' noise above which errors 5 s ahead are not explained by it."""
+
 
 def summarise(
     trajectories: Trajectories, evaluation: Evaluation, decided: Decided, judged: Judgement,
@@ -52,11 +55,15 @@ def summarise(
     run = units(problem.rows.records).run
     strengths = _strengths(first, problem, bar(first, run, judged.seed, len(test_runs)))
     others = [name for f in added if f.effect for name in f.equivalent if name in ALL]
-    verdict, refusal = _verdict(judged, rounds, added, others, strengths, evaluation)
+    left = (float("nan") if before is None else before.summary()["horizon_rmse_m"]), floor["horizon_rmse_m"]
+    is_large = left[0] > LARGE * left[1] and not judged.is_exact(judge.least_m(evaluation.records))
+    verdict, refusal = _verdict(judged, rounds, added, others, strengths, evaluation, is_large)
     data = _data(trajectories, evaluation, rounds, judged.null, by)
     sentence = words.headline(
         verdict, [f.clause for f in added], refusal, judged.tried, errors, judged.shared, others, law
     )
+    if (verdict in (Verdict.NONE, Verdict.UNDECIDED) and is_large) or refusal == Refusal(Reason.TAILS):
+        sentence = words.beside_noise(verdict, law, *left, judged.ladder)
     after = judged.after if judged.added else before
     sentence = " ".join(
         filter(None, (*_of_laws(judged, laws, drivers[0] if judged.on is not None else drivers[2]), sentence))
@@ -83,7 +90,7 @@ def summarise(
             )
             for key, c in errors.items()
         },
-        ladder=None if judged.ladder is None else _rungs(judged.ladder),
+        ladder=judged.ladder,
         interval=_how(before) if errors and before is not None else None,
         models=judged.names(),
         error=result.HeldOutErrors(
@@ -141,7 +148,7 @@ def _of_laws(judged: Judgement, laws: Sequence[bases.Law], drivers: Solution | N
 
 def _verdict(
     judged: Judgement, rounds: Sequence[Round], added: Sequence[result.TermFinding], others: Sequence[str],
-    strengths: dict[str, Strength], evaluation: Evaluation,
+    strengths: dict[str, Strength], evaluation: Evaluation, is_large: bool,
 ) -> tuple[Verdict, Refusal | None]:  # fmt: skip
     """Return what is concluded, and why nothing (more) was added."""
     first, refusal, ladder, problem = rounds[0], judged.refusal, judged.ladder, evaluation.searching.problem
@@ -160,7 +167,8 @@ def _verdict(
     )  # fmt: skip
     if verdict is Verdict.NONE and refusal is not None:
         small = judged.is_exact(least) or refusal.reason is Reason.SMALL_SIZE
-        return verdict, Refusal(Reason.SMALL_SIZE, least) if small else Refusal(Reason.NO_GAIN)
+        refusal = Refusal(Reason.SMALL_SIZE, least) if small else Refusal(Reason.NO_GAIN)
+        return (verdict, refusal) if not is_large else unsure(ladder, refusal)
     if refusal is not None and refusal.reason not in (Reason.NO_GAIN, Reason.SMALL_SIZE):
         return verdict, refusal
     if verdict is Verdict.UNEXPLAINED and unnamed and refusal is not None:
@@ -168,6 +176,16 @@ def _verdict(
     if verdict is Verdict.CANNOT_TELL and not power:
         refusal = Refusal(Reason.NO_POWER, len(problem.rows.records.runs))
     return verdict, refusal
+
+
+def unsure(ladder: Ladder | None, refusal: Refusal) -> tuple[Verdict, Refusal]:
+    """Return the verdict on errors far above the sensors' in which no candidate gains.
+
+    Noise of drivers explains them where it looks like them in every test; an effect of an unknown form does, too.
+    """
+    if ladder is not None and ladder.is_somewhere:
+        return Verdict.UNEXPLAINED, Refusal(Reason.TAILS)
+    return Verdict.NONE if ladder is not None and ladder.agrees else Verdict.UNDECIDED, refusal
 
 
 def bar(first: Round, run: np.ndarray, seed: int, kept: int) -> Bar:
@@ -187,13 +205,6 @@ def _strengths(first: Round, problem: Problem, reached: Bar) -> dict[str, Streng
             if strength is not None:
                 strengths[s.term.effect] = strength
     return strengths
-
-
-def _rungs(ladder: Ladder) -> result.Rungs:
-    return result.Rungs(
-        ladder.rungs, **ladder.others, parts=ladder.parts, structure=result.Share(*ladder.structure),
-        dependences=ladder.dependences, agreement=ladder.agreement, leading=ladder.leading,
-    )  # fmt: skip
 
 
 def _how(before: judge.Judged) -> str:

@@ -21,6 +21,7 @@ class Verdict(str, Enum):
     """What is said of the model on these data."""
 
     NONE = "none"
+    UNDECIDED = "undecided"
     NAMED = "named"
     ONE_OF = "one_of"
     SHAPE = "shape"
@@ -42,6 +43,7 @@ class Reason(str, Enum):
     HELD_OUT = "held_out"
     LAW = "law"
     STRUCTURE = "structure"
+    TAILS = "tails"
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Refusal:
     """Why, and the figure that decided: runs left to choose on, the best candidate's share, the least size (m)."""
 
     reason: Reason
-    figure: float = float("nan")
+    figure: float = 0.0
 
 
 HOLDS = 1.05

@@ -18,6 +18,7 @@ from idm_env.discovery.result import Ceilings, TermFinding, Weight
 from idm_env.discovery.score import Contrast
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution
+from idm_env.discovery.tails import WORST
 from idm_env.discovery.verdict import HOLDS, Reason, Refusal, Verdict
 from idm_env.effects import ALL
 from idm_env.effects.free import FEATURES, PER
@@ -162,6 +163,7 @@ def reason(refusal: Refusal | None, tried: str = "", law: str = "IDM") -> str:
             f"a smooth function of the scene takes {refusal.figure:.0%} off the squared error 5 s ahead, "
             "and no candidate does"
         ),
+        Reason.TAILS: "the worst predictions lie together",
         Reason.LAW: f"another law predicts better than all that was added to {law}",
     }[refusal.reason]
 
@@ -208,6 +210,29 @@ def headline(
             f"{_rises(errors)} on the test set."
         )
     return f"Something is missing that no candidate explains: {reason(refusal, tried)}."
+
+
+def beside_noise(verdict: Verdict, law: str, left_m: float, floor_m: float, ladder: Ladder | None) -> str:
+    """Say of errors 5 s ahead far above the sensors' ``floor_m`` whether noise of drivers may be all that they are."""
+    error = f"{law} leaves {number(left_m, 2)} m 5 s ahead, {left_m / floor_m:.0f} times the sensors' noise"
+    drivers = "unsteady drivers"
+    if ladder is not None and ladder.unsteady is not None and ladder.unsteady[0] > 0.0:
+        drivers += f" of σ = {number(ladder.unsteady[0], 2)} m/s² (memory {number(ladder.unsteady[1])} s)"
+    if verdict is Verdict.NONE:
+        return f"Nothing is missing that these data could show: {error}, as {drivers} do."
+    if verdict is Verdict.UNDECIDED:
+        return f"{error}; {drivers} would explain it, and so would an effect of a form that was not tried."
+    return f"{error}, and no candidate explains it. {' '.join(tails(ladder))}"
+
+
+def tails(ladder: Ladder | None) -> list[str]:
+    """Say how much of the squared error the worst predictions hold, and where these are."""
+    if ladder is None or ladder.tails is None:
+        return []
+    where, p = ladder.worst, number(ladder.tails.p_value, 2)
+    lies = f", {where.share:.0%} of it {where.where} ({where.of_all:.0%} of the time)" if where is not None else ""
+    share = f"The worst {WORST:.0%} of predictions hold {ladder.tails.share:.0%} of the squared error{lies}"
+    return [f"{share}; noise of drivers holds as much with p = {p}, from {ladder.tails.replicas} simulations."]
 
 
 def common(shared: Shared) -> str:
@@ -266,7 +291,7 @@ def details(verdict: Verdict, found: Sequence[TermFinding], nearest: Sequence[Te
             parts.append(f"It is most easily confused with {', '.join(spoken(x) for x in f.looks_like[:3])}.")
         if f.told_by:
             parts.append(f"What would tell: {f.told_by}.")
-    if verdict is Verdict.NONE:
+    if verdict in (Verdict.NONE, Verdict.UNDECIDED):
         parts.append(
             f"A smooth function of the state without a name would lower the 5 s error by {100 * max(left, 0.0):.1f} % "
             "on these runs. That no candidate helps does not say what the rest is."
@@ -287,7 +312,7 @@ def _below(strength: str) -> str:
 
 def excluded(verdict: Verdict, strengths: Mapping[str, Strength]) -> list[str]:
     """Say which strengths of absent effects the data exclude, and which they would not have shown."""
-    if verdict not in (Verdict.NONE, Verdict.CANNOT_TELL) or not strengths:
+    if verdict not in (Verdict.NONE, Verdict.UNDECIDED, Verdict.CANNOT_TELL) or not strengths:
         return []
     bounds = [
         f"{plain(name)} beyond {number(s.low, 2)} … {amount(float(f'{s.high:.2g}'), s.parameter.unit)}"
@@ -322,7 +347,7 @@ def agreement(ladder: Ladder | None, leading: Term | None) -> list[str]:
         f"How often {who} takes as much off the squared error where drivers' and sensors' noise is all there is: "
         f"p = {number(one.p_value, 2)}, from {one.replicas} simulations."
         for who, one in agreements.items() if one is not None
-    ]  # fmt: skip
+    ] + tails(ladder)  # fmt: skip
 
 
 def fleet_first(fleet: Kinds) -> str:
@@ -421,8 +446,6 @@ def ceilings(of: Ceilings, before_m: float | None, floor_m: float | None = None)
     parts = []
     if (share := of.repeats_share) is not None:
         parts.append(f"{100 * share:.0f} % of the gap's squared error repeats in matched situations of other runs")
-    if (halves := of.time_gap_between_halves) is not None:
-        parts.append(f"a driver's time gaps in the first and second half of a record correlate by {number(halves, 2)}")
     if (refit := of.refitted_gap_rmse_m) is not None and before_m is not None:
         parts.append(f"parameters fitted to the test set itself leave {number(refit)} m of {number(before_m)} m")
     if (smooth := of.smooth_function_gain) is not None:

@@ -53,15 +53,15 @@ def test_what_lasts_in_a_driver_is_drift_and_no_structure(records: Records, carr
     found = climbed(records, noise(records, carry))
     assert not found.unnamed and found.parts["structure without a name"] < 0.02
     assert sum(found.parts.values()) == pytest.approx(1.0)
-    assert (found.rungs["drift followed"] < 0.95 * found.rungs["own"]) == (carry > 0.0)
+    assert (found.rungs_m["drift followed"] < 0.95 * found.rungs_m["own"]) == (carry > 0.0)
     # Of errors that carry on by 0.6 a third is foreseen by the last two; of new ones nothing.
     assert (0.2 < found.parts["drift"] < 0.45) if carry else found.parts["drift"] < 0.02
     assert found.parts["not foreseen"] > 0.5
-    assert found.others["ten_s_m"] == {name: pytest.approx(2.0 * found.rungs[name]) for name in ("all", "own")}
-    assert set(found.others["free_m"]) == {"all", "own"}
+    assert found.ten_s_m == {name: pytest.approx(2.0 * found.rungs_m[name]) for name in ("all", "own")}
+    assert set(found.free_m) == {"all", "own"}
     # Of normal errors whose width is known the CRPS is σ/√π; the width is that of some other windows of the driver.
-    assert found.others["crps_m"]["own"] == pytest.approx(found.rungs["own"] / np.pi**0.5, rel=0.05)
-    assert next(iter(found.rungs)) == "all" and list(found.rungs)[-1] == "sensors alone"
+    assert found.crps_m["own"] == pytest.approx(found.rungs_m["own"] / np.pi**0.5, rel=0.05)
+    assert next(iter(found.rungs_m)) == "all" and list(found.rungs_m)[-1] == "sensors alone"
 
 
 def test_what_the_scene_tells_is_structure(records: Records) -> None:
@@ -69,8 +69,8 @@ def test_what_the_scene_tells_is_structure(records: Records) -> None:
     part = closing(records)
     part *= 0.5 / part.std()
     found = climbed(records, noise(records, 0.3) + part)
-    assert found.unnamed and 0.2 < found.structure[0] < 0.6
-    assert found.parts["structure without a name"] == pytest.approx(found.structure[0], abs=1e-6)
+    assert found.unnamed and 0.2 < found.structure.share < 0.6
+    assert found.parts["structure without a name"] == pytest.approx(found.structure.share, abs=1e-6)
 
 
 @pytest.mark.parametrize("slope", [0.0, 1.5, -1.5])
@@ -98,7 +98,7 @@ def test_of_a_single_driver_nothing_is_foreseen() -> None:
     made, _ = synthetic.generate(4, runs=1, followers=1, seconds=120.0)
     alone = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     found = climbed(alone, noise(alone, 0.6))
-    assert not found.unnamed and found.rungs["drift followed"] == found.rungs["own"]
+    assert not found.unnamed and found.rungs_m["drift followed"] == found.rungs_m["own"]
 
 
 def test_nothing_is_not_said_of_an_effect_without_a_name(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,14 +38,15 @@ def test_noise_of_drivers_is_that_of_the_data_and_what_it_leaves_agrees(ou: floa
     drivers = replica.drivers_of(problem, found, floor_of(problem))
     assert np.median(drivers.sigma) == pytest.approx(ou, abs=0.02)
     assert not ou or 2.0 <= drivers.memory_s <= 8.0
-    agreement = replica.agreement(problem, found, floor_of(problem), 0)[0]
-    assert not agreement.is_refused and agreement.p_value >= 0.05 and agreement.replicas >= replica.ENOUGH
+    _, told = replica.agreement(problem, found, floor_of(problem), 0)
+    for one in told.values():
+        assert not one.is_refused and one.p_value >= 0.05 and one.replicas >= replica.ENOUGH
 
 
 def test_noise_gains_a_candidate_as_much_in_replicas() -> None:
     """Noise of 0.2 m/s² passes for a weaker pull to the gap, which sign flips of runs take for an effect."""
     problem, found = fitted(599009, 0.2, runs=10, seconds=180.0)
-    leading = replica.agreement(problem, found, floor_of(problem), 0, simple("gap_stiffness"))[1]
+    leading = replica.agreement(problem, found, floor_of(problem), 0, simple("gap_stiffness"))[1]["leading"]
     assert leading.share > 1.5 * LEAST_GAIN and not leading.is_refused
 
 
@@ -57,5 +58,6 @@ def test_what_drivers_do_in_a_state_is_no_noise(monkeypatch: pytest.MonkeyPatch)
         return usual(speed, np.where(closing > 2.0, 2.0 * closing - 2.0, closing), time_gap, drivers)
 
     monkeypatch.setattr(hidden, "_desired_gap", doubled)
-    told = replica.agreement(*fitted(4, 0.1), 0.05, 0, curve("time_gap", "closing_speed", -3.0, 1.0, 8))
-    assert all(one.is_refused and one.replicas == replica.DRAWS for one in told) and told[0].share > 0.02
+    _, told = replica.agreement(*fitted(4, 0.1), 0.05, 0, curve("time_gap", "closing_speed", -3.0, 1.0, 8))
+    for one in (told["scene"], told["leading"]):
+        assert one.is_refused and one.replicas == replica.DRAWS and one.share > 0.02
