@@ -199,7 +199,7 @@ def test_gradients_of_the_reward_are_finite_differences() -> None:
 
 def test_bad_choices_are_one_line() -> None:
     """An inflow of none."""
-    with pytest.raises(ValueError, match="inflow of lane 0 = 0"):
+    with pytest.raises(ValueError, match="ramp_inflow = 0"):
         make_task("merge", ramp_inflow=0.0)
     with pytest.raises(ValueError, match="entry_speed = 0"):
         make_task("bottleneck", entry_speed=0.0)
