@@ -71,7 +71,8 @@ def test_drivers_of_many_runs_may_share_parameters() -> None:
     found = discover(alike, effects=["lag", "grade"], by="all")
     assert [f["effect"] for f in found.report["found"]] == ["grade"]
     given = discover(alike, effects=["lag"], by="vehicle_id", known=["grade"])
-    assert given.verdict == "none"
+    # Drivers of one identifier differ by 5 %: what a shared model leaves of them is nine times the sensors' noise.
+    assert given.verdict == "undecided" and given.report["found"] == []
     assert given.report["known"][0]["estimate"] == pytest.approx(1.0, abs=0.05)
 
 

@@ -223,8 +223,8 @@ def test_memory_does_not_grow_with_windows():
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
     before = resident(30)
-    # A window's tape is some 100 kB: a tenth of those kept would be 10 MB.
-    assert resident(1000) - before < 1 << 20
+    # A window's tape is some 100 kB: a tenth of those kept would be 10 MB; the allocator alone takes up to 1.3 MB.
+    assert resident(1000) - before < 4 << 20
 
 
 class Blind(nn.Module):
