@@ -229,11 +229,11 @@ def top_level() -> set[str]:
         (arrows, 174),
         (circles, 0),
         (classes_named_twice, 7),
-        (lines_of_code, 36450),
+        (lines_of_code, 36250),
         (functions_of_many_parameters, 21),
         (high_packages, 1),
         (file_names_twice, 25),
-        (set_by_hand, 333),
+        (set_by_hand, 305),
     ],
     ids=lambda x: getattr(x, "__name__", None),
 )
