@@ -43,9 +43,8 @@ def _join(params: dict[str, Any], name: str) -> None:
 
         layout, columns = params.get("layout", "auto"), params.get("columns")
         out = Path(os.path.realpath(params["out"]))  # resolve() raises for a link to itself
-        if (out / storage.MARK).exists() and (
-            old := next((p for p in paths if Path(os.path.realpath(p)).parent == out), None)
-        ):
+        inside = (p for p in paths if Path(os.path.realpath(p)).parent == out)
+        if (out / storage.MARK).exists() and (old := next(inside, None)):
             raise ValueError(f"{old} lies in --out, whose results are replaced. Give --out another folder.")
         params[name] = [joined(paths, layout=layout, columns=columns, whole=not folders)]
         if params[name][0] not in paths:

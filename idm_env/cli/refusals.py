@@ -40,7 +40,7 @@ def refuse(given: Mapping[str, Any]) -> None:
 
     layout = one_of("--layout", given.get("layout", "auto"), LAYOUTS)
     paths = [Path(path) for path in (data if isinstance(data, (list, tuple)) else [data])]
-    if len(paths) == 1 and paths[0].is_dir() and any(paths[0].rglob("*.parquet")):
+    if len(paths) == 1 and folder.is_partitioned(paths[0]):
         files = [Path(name) for name in folder.files_of(paths[0])]
         files = files if len(files) == 1 else []  # columns may be in the names of folders
     else:

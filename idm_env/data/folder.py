@@ -80,6 +80,11 @@ def shares(folder: Path, vehicles: int, columns: Columns = None) -> list[FolderS
     return [replace(cut[0], runs=())] if len(cut) == 1 else cut or [FolderSlice(folder, tuple(files), (), 0, columns)]
 
 
+def is_partitioned(path: Path) -> bool:
+    """Tell whether a path is a folder with parquet files in it or below it: one table, in parts."""
+    return path.is_dir() and any(path.rglob("*.parquet"))
+
+
 def files_of(folder: Path) -> list[str]:
     """Return the parquet files in a folder and below it, in the order of their names. DataError if there is none."""
     files = sorted(str(path) for path in folder.rglob("*.parquet") if not path.name.startswith((".", "_")))

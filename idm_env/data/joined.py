@@ -7,7 +7,7 @@ from pathlib import Path
 
 import polars as pl
 
-from idm_env.data import clean, plain
+from idm_env.data import clean, folder, plain
 from idm_env.data.errors import Counted, DataError
 from idm_env.data.load import REPAIRS, batches, files_of
 from idm_env.data.names import Columns, check_columns
@@ -24,7 +24,7 @@ def joined(paths: Sequence[str | Path], *, layout: str = "auto", columns: Column
         DataError: If there is no file, one of them cannot be read, or only some name leaders.
     """
     path = Path(paths[0])
-    partitioned = len(paths) == 1 and path.is_dir() and any(path.rglob("*.parquet"))
+    partitioned = len(paths) == 1 and folder.is_partitioned(path)
     files = [path] if partitioned else files_of([Path(p) for p in paths])
     if len(files) == 1 and not (partitioned and whole):
         return files[0]

@@ -56,8 +56,9 @@ def summarise(
     strengths = _strengths(first, problem, bar(first, run, judged.seed, len(test_runs)))
     others = [name for f in added if f.effect for name in f.equivalent if name in ALL]
     left = (float("nan") if before is None else before.summary()["horizon_rmse_m"]), floor["horizon_rmse_m"]
-    is_large = left[0] > LARGE * left[1] and not judged.is_exact(judge.least_m(evaluation.records))
-    verdict, refusal = _verdict(judged, rounds, added, others, strengths, evaluation, is_large)
+    least = judge.least_m(evaluation.records)
+    is_large = left[0] > LARGE * left[1] and not judged.is_exact(least)
+    verdict, refusal = _verdict(judged, rounds, added, others, strengths, problem, least, is_large)
     data = _data(trajectories, evaluation, rounds, judged.null, by)
     sentence = words.headline(
         verdict, [f.clause for f in added], refusal, judged.tried, errors, judged.shared, others, law
@@ -148,10 +149,10 @@ def _of_laws(judged: Judgement, laws: Sequence[bases.Law], drivers: Solution | N
 
 def _verdict(
     judged: Judgement, rounds: Sequence[Round], added: Sequence[result.TermFinding], others: Sequence[str],
-    strengths: dict[str, Strength], evaluation: Evaluation, is_large: bool,
+    strengths: dict[str, Strength], problem: Problem, least: float, is_large: bool,
 ) -> tuple[Verdict, Refusal | None]:  # fmt: skip
     """Return what is concluded, and why nothing (more) was added."""
-    first, refusal, ladder, problem = rounds[0], judged.refusal, judged.ladder, evaluation.searching.problem
+    first, refusal, ladder = rounds[0], judged.refusal, judged.ladder
     counted = units(problem.rows.records)
     power = len(problem.rows.records.runs) >= MANY_RUNS or powerful(
         [s for s in strengths.values() if s.knots == 1], first.tested, smallest_p(counted.run)
@@ -163,7 +164,7 @@ def _verdict(
         bool(added), any(f.effect for f in added), refusal, structured or unnamed > 0.0, first.left, power,
         judged.shared is not None, apart=not others,
         in_a_state=all(f.where.coordinate in (*STATES, "state") for f in added),
-        exact=judged.is_exact(least := judge.least_m(evaluation.records)),
+        exact=judged.is_exact(least),
     )  # fmt: skip
     if verdict is Verdict.NONE and refusal is not None:
         small = judged.is_exact(least) or refusal.reason is Reason.SMALL_SIZE

@@ -63,16 +63,15 @@ def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple
         base: Number of terms that belong to the null.
         seed: Of the signs.
     """
-    fit, solution = start, None
-    steps: list[Step] = []
+    fit, solution, records = start, None, start.problem.rows.records
+    steps, least = list[Step](), judge.least_m(records)
     while len(fit.model.terms) - base < MOST_TERMS:
         step, grown = _forward(searching, fit, seed)
         steps.append(step)
         if grown is None:
             break
-        records = fit.problem.rows.records
         after = closed_loop.evaluate(records, grown.model, grown.values, fit.problem.prior, grown.theta)
-        moved, least = after.linear.residual - fit.linear.residual, judge.least_m(records)
+        moved = after.linear.residual - fit.linear.residual
         late = is_too_short(grown, grown.model.terms[-1:], records.dt)
         if late or float(np.sqrt(np.mean(moved[after.problem.rows.valid] ** 2))) < least:
             step.winner, step.refusal = None, Refusal(Reason.SMALL_SIZE, least)

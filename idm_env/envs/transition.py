@@ -164,7 +164,7 @@ class Tables:
         self.plan, self.layout, self.params = plan, layout, params
         self.recorded = recorded = plan.recorded(params)
         self.still = {**layout.still, **{n: self._array(params[e][p]) for n, (e, p) in recorded.parameters.items()}}
-        self.ahead = RowTable(recorded.forward, self.still, (*plan.before, *plan.groups("then_")))
+        self._forward = (*plan.before, *plan.groups("then_"))
         self._watched = [(own, p, x, x._version) for own in params.values() for p, x in own.items()]
         names = [recorded.parameters[n] for n in recorded.wanted]
         self.wanted = [(i, params[e][p]) for i, (e, p) in enumerate(names)]
@@ -176,10 +176,14 @@ class Tables:
         return np.array(x.expand(self.plan.rows, wide).numpy(), order="C")
 
     @cached_property
+    def ahead(self) -> RowTable:
+        """The table of windows, which have arrays of their own for what is told."""
+        return RowTable(self.recorded.forward, self.still, self._forward)
+
+    @cached_property
     def once(self) -> RowTable:
-        """The table of single steps; ``ahead`` is that of windows."""
-        groups = *self.plan.before, *self.plan.groups("then_")
-        return RowTable(self.recorded.forward, self.still | self.room.arrays, groups)
+        """The table of single steps."""
+        return RowTable(self.recorded.forward, self.still | self.room.arrays, self._forward)
 
     @cached_property
     def back(self) -> RowTable:
