@@ -64,7 +64,8 @@ def behaviour(
 
     ``required`` effects are the task's machinery (control, replay, noise). ``effects`` is a list to add to ``own``,
     or the path of a model file, which replaces ``own`` and its parameters and gives dt and integration unless they
-    are given. So does ``drivers``, the path of a model file with single drivers, of whom these are kept.
+    are given; machinery that it does not have keeps its own. So does ``drivers``, the path of a model file with single
+    drivers, of whom these are kept.
     ValueError where both are given.
     """
     values, single = own_parameters, dict[tuple[str, str], tuple[float, ...]]()
@@ -86,7 +87,9 @@ def behaviour(
             chosen = [e for e in chosen if e.name != effect.name and not (following and isinstance(e, CarFollowing))]
             chosen.append(effect)
     names = {e.name for e in chosen}
-    chosen += [e for e in required if e.name not in names]
+    machinery = [e for e in required if e.name not in names]
+    chosen += machinery
+    values = {e.name: own_parameters[e.name] for e in machinery if e.name in own_parameters} | values
     all_names = {e.name for e in chosen}
     values = {effect: dict(part) for effect, part in values.items() if effect in all_names}
     for key, change in nested({} if changes is None else changes).items():

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
 from benchmarks import lane_tasks
+from idm_env.effects import IDM, Brakes
+from idm_env.model_file import Model, save_model
 from idm_env.tasks import Draw, make_task
 from idm_env.types import Command
 
@@ -93,3 +96,14 @@ def test_what_cannot_be_is_one_line(choices: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says) as error:
         make_task("approach", **choices)
     assert "\n" not in str(error.value)
+
+
+def test_the_signal_stays_where_drivers_come_from_a_file(tmp_path: Path) -> None:
+    """A model of drivers alone says nothing of the road: its signal is at the line, with the cycle asked for."""
+    save_model(tmp_path / "model.yaml", Model((IDM(), Brakes()), {"idm": {"time_gap": 1.7}}))
+    task = make_task("approach", effects=str(tmp_path / "model.yaml"), cycle=40.0, green=10.0)
+    params = task.params(torch.float64, "cpu")
+    expected = {"signal": {"place": 500.0, "cycle": 40.0, "red": 30.0}, "idm": {"time_gap": 1.7}}
+    for effect, values in expected.items():
+        for name, value in values.items():
+            assert bool((params[effect][name] == value).all()), name
