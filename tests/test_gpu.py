@@ -2,9 +2,11 @@
 
 from functools import partial
 
+import gymnasium
 import pytest
 import torch
 
+import idm_env  # noqa: F401
 from tests.laws.members import DTYPE, MEMBERS, N, around, inputs_for, label, start
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here: its tests have not run")
@@ -48,25 +50,27 @@ def test_every_effect_is_the_same_on_a_gpu():
                 torch.testing.assert_close(other, mine, rtol=1e-8, atol=1e-9, msg=said)
 
 
-@pytest.mark.parametrize("task", ["ring", "follow", "platoon"])
+@pytest.mark.parametrize("task", ["ring", "follow", "platoon", "highway", "merge", "approach"])
 def test_environments_give_on_a_gpu_what_they_give_on_the_cpu(task):
-    gymnasium = pytest.importorskip("gymnasium")
-    import idm_env  # noqa: F401
-
     seen = {}
     for device in ("cpu", "cuda"):
-        short = {"warmup": 50} if task == "ring" else {}
-        env = gymnasium.make_vec(
-            "DiffIDM-v0", num_envs=8, task=task, output="torch", device=device, dtype="float64", **short
-        )
-        env.reset(seed=3)
-        action = torch.full((8, 1), 0.3, dtype=torch.float64, device=device, requires_grad=True)
-        total = 0.0
-        for _ in range(10):
-            observation, reward, *_ = env.step(action)
-            total = total + reward.sum()
-        total.backward()
-        assert observation.device.type == device
-        seen[device] = (observation.detach().cpu(), reward.detach().cpu(), action.grad.cpu())
+        seen[device] = driven(task, device)
     for mine, other in zip(seen["cpu"], seen["cuda"], strict=True):
         torch.testing.assert_close(other, mine, rtol=1e-9, atol=1e-9)
+
+
+def driven(task, device):
+    """Return the last observation and reward of ten steps, and the gradient by the action, on the CPU."""
+    short = {"warmup": 50} if task == "ring" else {}
+    env = gymnasium.make_vec(
+        "DiffIDM-v0", num_envs=8, task=task, output="torch", device=device, dtype="float64", **short
+    )
+    env.reset(seed=3)
+    action = torch.full(env.action_space.shape, 0.3, dtype=torch.float64, device=device, requires_grad=True)
+    total = torch.zeros((), dtype=torch.float64, device=device)
+    for _ in range(10):
+        observation, reward, *_ = env.step(action)
+        total = total + reward.sum()
+    total.backward()
+    assert observation.device.type == device
+    return observation.detach().cpu(), reward.detach().cpu(), action.grad.cpu()

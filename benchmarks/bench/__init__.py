@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.bench import fits, gradients, memory, peers, tables, traffic
+from benchmarks.bench import fits, gpu, gradients, memory, peers, tables, traffic
 from benchmarks.bench.measure import Case, machine, measure
 from idm_env import kernels
 from idm_env.jobs import storage
@@ -90,7 +90,7 @@ def run(
     finally:
         torch.set_num_threads(threads)
     tell("gpu" if torch.cuda.is_available() else "the report")
-    result["gpu"] = _gpu(sizes, rounds) if torch.cuda.is_available() else None
+    result["gpu"] = gpu.rows(sizes, rounds) if torch.cuda.is_available() else None
     if out is not None:
         from benchmarks.bench.picture import draw
 
@@ -130,26 +130,6 @@ def _lanes(vehicles: int, rounds: int, compiled: bool, verbose: bool, say: Say) 
     clock = "cpu" if torch.get_num_threads() == 1 else "wall"
     triad = times["triad"][f"{clock}_min_ms"]
     return {"times_ms_per_step": times, "triad_bytes": moved, "triad_gb_s": moved / triad / 1e6}
-
-
-def _gpu(sizes: Sequence[int], rounds: int) -> dict[str, Any]:
-    """Return milliseconds per step of the compiled step on the GPU, by CUDA events."""
-    fastest: dict[str, Any] = {}
-    for vehicles in sizes:
-        lanes = traffic.Traffic(vehicles, "cuda")
-        for backward in (False, True):
-            case = lanes.ours(lanes.simulator.compile(), False, backward)
-            case.run()
-            times = []
-            for _ in range(rounds):
-                begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-                begin.record()
-                case.run()
-                end.record()
-                torch.cuda.synchronize()
-                times.append(begin.elapsed_time(end) / case.units)
-            fastest[f"{vehicles} {'forward+backward' if backward else 'forward'}"] = min(times)
-    return fastest
 
 
 def growth(one_core: dict[str, Any]) -> dict[str, float]:

@@ -54,8 +54,10 @@ def of(result: Mapping[str, Any]) -> list[tuple[str, Rows, str]]:
         rows = [{name: row.get(name, "") for name in names} for row in rows]
         tables.append(("Memory of 100 steps with their gradient", rows, "1 is linear."))
     if result.get("gpu"):
-        rows = [{"vehicles and pass": name, "ms per step": value} for name, value in result["gpu"].items()]
-        tables.append(("GPU, the compiled step", rows, str(result["machine"].get("gpu"))))
+        rows = [
+            {"case": name, "ms per step": value} for name, value in result["gpu"].items() if isinstance(value, float)
+        ]
+        tables.append(("GPU: compiled rollouts, and environments in torch", rows, str(result["machine"].get("gpu"))))
     return tables
 
 
