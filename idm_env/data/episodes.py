@@ -142,7 +142,6 @@ def _stride(trajectories: Trajectories, run: str, dt: float | None) -> int:
         return 1
     stride = dt / trajectories.steps[run]
     if stride < 0.99 or abs(stride - round(stride)) > 0.01:
-        raise DataError(
-            f"dt = {dt:g} s is no multiple of the step of run {run}, {trajectories.steps[run]:g} s; choose one."
-        )
+        step = trajectories.steps[run]
+        raise DataError(f"dt = {dt:g} s is no multiple of the step of run {run}, {step:g} s. Give dt={step:g}.")
     return round(stride)

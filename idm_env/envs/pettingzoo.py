@@ -1,7 +1,8 @@
 """PettingZoo: every controlled vehicle is an agent of its own, in any of the tasks.
 
 ``parallel_env(**keywords)`` steps all agents at once; ``env(**keywords)`` and ``raw_env(**keywords)`` are the same
-turn by turn. Keywords are those of ``gym.make("DiffIDM-v0", …)``, with ``max_cycles`` for the number of steps.
+turn by turn. Keywords are those of ``gym.make("DiffIDM-v0", …)``, with ``max_cycles`` as another name of
+``max_episode_steps``.
 
 Shapes: an agent observes ``[features]``; the state of the traffic is one row, ``[features of all]``.
 """
@@ -37,6 +38,9 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
     An agent that has terminated or been truncated leaves ``agents``, and its vehicle goes back to its driver. Where
     vehicles enter and leave, every trip is an agent of its own, ``vehicle_i_trip_k``: it appears when its vehicle
     enters, and terminates when that has left. While no agent is there traffic goes on until one is, or the end.
+    With ``fixed`` agents are the slots ``vehicle_i``, there until the end, as TorchRL's ``PettingZooWrapper`` needs.
+    The mask ``info["present"]`` says whose vehicle is on the road; others observe zeros, and their actions do nothing.
+    Infos then hold numbers alone, and after ``reset`` the same names as after a step.
     ``state()`` is the whole traffic: speed/30 of every vehicle, then gap/100 (capped at 1000 m). Numpy only:
     gradients are the business of the Gymnasium faces.
 
@@ -52,8 +56,13 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         "render_fps": 10,
     }
 
-    def __init__(self, *, max_cycles: int | None = None, render_mode: str | None = None, **keywords: Any) -> None:
-        own = settings(max_episode_steps=max_cycles, render_mode=render_mode, **keywords)
+    def __init__(
+        self, *, max_cycles: int | None = None, render_mode: str | None = None, fixed: bool = False, **keywords: Any
+    ) -> None:
+        limit = keywords.pop("max_episode_steps", max_cycles)
+        if max_cycles not in (None, limit):
+            raise ValueError(f"max_cycles = {max_cycles} and max_episode_steps = {limit} are one limit. Leave one out.")
+        own = settings(max_episode_steps=limit, render_mode=render_mode, **keywords)
         if own.output != "numpy":
             raise ValueError("output = 'torch' has no meaning for PettingZoo. Use gym.make_vec for gradients.")
         self.settings = own
@@ -61,13 +70,14 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         self.max_cycles = own.limit
         self.render_mode = own.render_mode
         self.batch = Batch(own, 1)
-        trips = [f"_trip_{k}" for k in range(1, self.task.journeys + 1)] or [""]
+        self._fixed, self._journeys = fixed, 0 if fixed else self.task.journeys
+        trips = [f"_trip_{k}" for k in range(1, self._journeys + 1)] or [""]
         self.possible_agents = [f"vehicle_{i}{trip}" for i in self.task.agents for trip in trips]
         self.agents: list[str] = []
         self._slots: list[str] = []
         seen, done = (partial(observation_box, self.task, own.dtype, 1), partial(action_space, self.task, 1))
         # Agents that begin later share one space: whoever seeds those of the first ones has seeded theirs.
-        later = bool(self.task.journeys)
+        later = bool(self._journeys)
         self.observation_spaces, self.action_spaces = (
             dict.fromkeys(self.possible_agents, make()) if later else {a: make() for a in self.possible_agents}
             for make in (seen, done)
@@ -131,7 +141,7 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         rewards, terminated, truncated = (self._by_agent(x[0].tolist()) for x in outcome[1:4])
         infos = {agent: self._info(i, outcome) for i, agent in enumerate(before) if live[i]}
         self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
-        if self.task.journeys and self.agents:
+        if self._journeys and self.agents:
             self._arrived(outcome, (observations, rewards, terminated, truncated, infos))
         if self.render_mode == "human":
             self.render()
@@ -139,7 +149,7 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
 
     def _appear(self) -> list[str]:
         """Return the agents that are there now, and note whose every slot is ("" for nobody's)."""
-        if not self.task.journeys:
+        if not self._journeys:
             self._slots = list(self.possible_agents)
             return list(self._slots)
         state = self.batch.glance().state
@@ -168,7 +178,13 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         self.agents = now
 
     def _begun(self, i: int) -> dict[str, Any]:
-        """Return the recorded id of an agent's vehicle, where there is one."""
+        """Return the recorded id of an agent's vehicle, where there is one; of fixed agents all that a step tells."""
+        if self._fixed:
+            none = np.zeros(len(self.task.reward_names))
+            first = {"accel": 0.0, "command": np.nan, "failsafe": False, "crash": False, "rewards": none}
+            first |= {} if self.batch.counters is None else {"stops": 0}
+            first |= {name: x[0, i].item() for name, x in self.task.info(self.batch.glance()).items()}
+            return {name: x for name, x in first.items() if name in self.settings.info}
         names = ids(self.batch)
         return {} if names is None else {"vehicle_id": names[i]}
 
@@ -178,6 +194,8 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
             name: value[0, i].copy() if name == "rewards" else value[0, i].item()
             for name, value in outcome.details.items()
         }
+        if self._fixed:
+            return info
         if info.get("crash"):
             info["crash_reason"] = self.batch.crash_reason(0, i if self.task.shares > 1 else None)
         return info | self._begun(i)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from inspect import signature
 from typing import Any, Literal, cast
 
@@ -81,8 +81,11 @@ def settings(
         own = {key: in_file[key] if value is None else value for key, value in own.items()}
         choices = {**read, **choices}
     chosen = "ring" if own["task"] is None else own["task"]
-    if own["max_episode_steps"] is not None:
-        choices["max_episode_steps"] = own["max_episode_steps"]
+    limit = own["max_episode_steps"]
+    if isinstance(chosen, Task):  # what Gymnasium makes again from a spec tells the limit once more
+        chosen = chosen if limit is None or limit == chosen.horizon else replace(chosen, max_episode_steps=limit)
+    elif limit is not None:
+        choices["max_episode_steps"] = limit
     if isinstance(chosen, Task) and choices:
         raise KeywordError(
             f"unexpected keyword argument '{next(iter(choices))}' beside a task that is already made. "

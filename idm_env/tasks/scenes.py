@@ -77,7 +77,8 @@ def recorded_tracks(path: str, dt: float, runs: tuple[str, ...] | None) -> list[
     for run in chosen:
         stride = dt / trajectories.steps[run]
         if stride < 0.99 or abs(stride - round(stride)) > 0.01:
-            raise ValueError(f"dt = {dt:g} s is no multiple of the step of run '{run}', {trajectories.steps[run]:g} s.")
+            step = trajectories.steps[run]
+            raise ValueError(f"dt = {dt:g} s is no multiple of the step of run '{run}', {step:g} s. Give dt={step:g}.")
     return _tracks(trajectories.table, chosen, dt)
 
 

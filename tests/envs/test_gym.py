@@ -70,6 +70,17 @@ def test_spec_survives_json_and_makes_the_same_environment():
     assert data_equivalence(first, second, exact=True)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_task_that_is_an_object_is_checked_and_made_again_from_its_spec():
+    task = make_task("ring", warmup=5, max_episode_steps=9)
+    env, vector = gym.make("DiffIDM-v0", task=task), gym.make_vec("DiffIDM-v0", num_envs=2, task=task)
+    check_env(env.unwrapped, skip_render_check=True)
+    for again in (env.spec.make(), gym.make(env.unwrapped.spec), gym.make_vec(vector.spec)):
+        assert again.unwrapped.task.warmup == 5 and again.unwrapped.spec.max_episode_steps == 9
+    shorter = gym.make("DiffIDM-v0", task=task, max_episode_steps=4)
+    assert shorter.spec.max_episode_steps == shorter.unwrapped.task.horizon == 4 and task.horizon == 9
+
+
 def test_pickled_in_the_middle_of_an_episode_it_goes_on_the_same():
     env = quick()
     env.reset(seed=1)

@@ -120,9 +120,25 @@ def test_bad_actions_are_errors(bad):
         made.step(bad)
 
 
-def test_a_misspelled_keyword_has_a_suggestion():
+def test_a_misspelled_keyword_has_a_suggestion_and_the_limit_two_names():
     with pytest.raises(TypeError, match="Did you mean 'vehicles'"):
         parallel_env(vehicels=3)
+    assert parallel_env(max_episode_steps=7, **QUICK).max_cycles == parallel_env(max_cycles=7, **QUICK).max_cycles == 7
+    with pytest.raises(ValueError, match=r"max_cycles = 7 and max_episode_steps = 8 are one limit\. Leave one out\."):
+        parallel_env(max_cycles=7, max_episode_steps=8)
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_fixed_agents_are_there_until_the_end():
+    """PettingZoo's own test; and slots without a vehicle observe zeros."""
+    parallel_api_test(parallel_env(**TRIPS[0], fixed=True, max_cycles=30), num_cycles=60)
+    many = parallel_env(**TRIPS[0], fixed=True, max_cycles=30)
+    seen, infos = many.reset(seed=0)
+    assert many.agents == many.possible_agents == [f"vehicle_{i}" for i in many.task.agents]
+    for _ in range(30):
+        assert all(infos[agent]["present"] or not seen[agent].any() for agent in many.agents)
+        seen, _, _, truncated, infos = many.step({a: np.ones(1, np.float32) for a in many.agents})
+    assert all(truncated.values()) and not many.agents
 
 
 def test_agents_of_trips_come_and_go():

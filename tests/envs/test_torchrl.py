@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
-from torchrl.envs import GymEnv, GymWrapper
+from torchrl.envs import GymEnv, GymWrapper, PettingZooWrapper
 from torchrl.envs.utils import check_env_specs
 
 import idm_env  # noqa: F401
 from idm_env import backends
+from idm_env.envs.pettingzoo import parallel_env
 from idm_env.tasks import TASKS
 
 LIMIT, COUNT = 4, 3
@@ -100,3 +101,17 @@ def test_the_vector_says_its_mode_as_gymnasiums_vectors_do():
         env = vector(autoreset_mode=mode)
         assert env.autoreset_mode is env.metadata["autoreset_mode"] is mode
     assert vector().autoreset_mode is AutoresetMode.SAME_STEP
+
+
+@pytest.mark.parametrize("use_mask", [False, True])
+def test_fixed_agents_of_an_open_road_are_collected_with_their_mask(use_mask):
+    road = {"vehicles": 30, "controlled": [2, 9], "inflow": 2400.0, "ramp_inflow": 500.0, "max_episode_steps": 6}
+    with backends.off():
+        env = PettingZooWrapper(parallel_env(task="merge", fixed=True, **road), use_mask=use_mask)
+        check_env_specs(env)
+        own = env.unwrapped.task.bounds.names.index("present")
+        seen = env.rollout(15, break_when_any_done=False)
+    assert seen["next", "done"].sum() == 2
+    present, observed = (seen["next"]["vehicle"][name] for name in (("info", "present"), "observation"))
+    assert torch.equal(present > 0, observed[..., own] > 0) and (present > 0).any() and (present == 0).any()
+    assert set(seen["vehicle", "info"].keys()) == set(seen["next", "vehicle", "info"].keys())

@@ -192,7 +192,7 @@ def test_agents_end_one_by_one(recording):
         ({"model": "some"}, "'all' or a list"),
         ({"reward": "imitations"}, "Did you mean 'imitation'"),
         ({"vehicles": 5}, "Leave it out"),
-        ({"dt": 0.25}, "no multiple"),
+        ({"dt": 0.25}, r"no multiple of the step of run '\w+', 0.1 s. Give dt=0.1.$"),
     ],
 )
 def test_bad_choices_are_errors(recording, keywords, words):
