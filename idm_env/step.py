@@ -354,14 +354,16 @@ class CarFollowingStep:
         if scene.history is not None:
             memory[PAST] = scene.history.pushed(scene)
         memory |= merging.driven_on(state.memory, motion.displacement, self.dt)
-        after = state._replace(
+        after = State(
             position=motion.position,
             speed=motion.speed,
             accel=motion.accel,
             gap=self._gaps(state, motion),
+            length=state.length,
             step=state.step + 1,
             present=motion.present,
             memory=memory,
+            lanes=state.lanes,
         )
         return after if motion.lane is None else self.road.view(state).placed(state, motion.lane, after)
 

@@ -34,8 +34,10 @@ def outcome(effect, device):
     inputs = moved(inputs_for(simulator, STEPS, torch.zeros(N, dtype=DTYPE)), device)
     _, kept = simulator.rollout(state, inputs, params, STEPS)
     loss = sum((0.01 * x).sin().sum() for x in kept)
-    found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True) if leaves else ()
-    return [x.detach().cpu() for x in kept], [None if g is None else g.cpu() for g in found]
+    if leaves and loss.requires_grad:  # torch has no graph where nothing depends on a leaf; a kernel says 0 there
+        loss.backward()
+    slopes = [torch.zeros_like(x) if x.grad is None else x.grad for x in leaves.values()]
+    return [x.detach().cpu() for x in kept], slopes
 
 
 def test_every_effect_is_the_same_on_a_gpu():
@@ -45,9 +47,7 @@ def test_every_effect_is_the_same_on_a_gpu():
         for mine, other in zip(here[0], there[0], strict=True):
             torch.testing.assert_close(other, mine, rtol=1e-10, atol=1e-9, msg=said)
         for mine, other in zip(here[1], there[1], strict=True):
-            assert (mine is None) == (other is None), label(effect)
-            if mine is not None:
-                torch.testing.assert_close(other, mine, rtol=1e-8, atol=1e-9, msg=said)
+            torch.testing.assert_close(other.cpu(), mine, rtol=1e-8, atol=1e-9, msg=said)
 
 
 @pytest.mark.parametrize("task", ["ring", "follow", "platoon", "highway", "merge", "approach"])
