@@ -137,8 +137,8 @@ class Signal(Effect):
         red where (t − φ) mod C ≥ C − r;   who is before the line x_s and can stop, v² ≤ 2 b_m (x_s − x), stops there:
         A += −a max(0, (s*/s)²_line − (s*/s)²_leader),   that of somebody who stands at the line
 
-    Amber is in b_m: who would have to brake harder drives on. Who has begun to stop does so until it is green, however
-    late he brakes: that is his memory, 1 or 0. Absent at r = 0.
+    Amber is in b_m: who would have to brake harder drives on. Who has begun to stop does so until it has been green for
+    ρ, his reaction, however late he brakes: that is his memory, 1 or 0. Absent at r = 0.
     """
 
     kind: ClassVar[str] = "signal"
@@ -151,6 +151,7 @@ class Signal(Effect):
         Parameter("red", "r", "s", 30.0, 0.0, 3600.0, null=0.0, role="threshold", most="cycle"),
         Parameter("offset", "φ", "s", 0.0, -3600.0, 3600.0, role="shape"),
         Parameter("most_decel", "b_m", "m/s²", 3.0, 0.5, 9.0, role="threshold"),
+        Parameter("reaction", "ρ", "s", 0.0, 0.0, 10.0, null=0.0, role="threshold"),
     )
 
     @staticmethod
@@ -166,10 +167,11 @@ class Signal(Effect):
 
     def _stops(self, scene: Scene, p: P) -> Tensor:
         """Return who stops at the line (bool, ``[..., n]``)."""
-        _, red = self.phase(scene.time, p)
+        since, red = self.phase(scene.time, p)
         way = p["place"] - scene.position
         can = scene.speed * scene.speed <= 2.0 * p["most_decel"] * way
-        return red & (way >= 0) & (can | (scene.memory[self.name] > 0.5))
+        goes_on = (scene.memory[self.name] > 0.5) & (red | (since < p["reaction"]))
+        return (way >= 0) & (goes_on | (red & can))
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return what drivers brake for somebody who stands at the line while it is red (m/s²)."""

@@ -71,7 +71,7 @@ def test_compiled_rules_are_those_of_the_torch_path() -> None:
     """Decision after decision from the same states: links, and where everybody is."""
     pytest.importorskip("numba")
     simulator, state, params = begun(*RULES)
-    params["signal"]["place"] = torch.tensor(650.0, dtype=DTYPE)
+    params["signal"] |= {"place": torch.tensor(650.0, dtype=DTYPE), "reaction": torch.tensor(1.5, dtype=DTYPE)}
     for _ in range(70):
         with dispatch.off():
             expected, _ = simulator.rollout(state, {}, params, 10, keep=None)

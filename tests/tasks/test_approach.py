@@ -12,6 +12,7 @@ from benchmarks import lane_tasks
 from idm_env.effects import IDM, Brakes
 from idm_env.model_file import Model, save_model
 from idm_env.tasks import Draw, make_task
+from idm_env.tasks.approach import LINE
 from idm_env.types import Command
 
 ROWS = 4
@@ -48,6 +49,31 @@ def test_agents_see_the_signal_that_stops_traffic() -> None:
     crossed = both & (line[:-1] > 0) & (line[1:] == 0)
     assert int((crossed & (red[1:] == 0)).sum()) > 20
     assert int((crossed & (red[:-1] > 0) & (until[:-1] < 22.0)).sum()) == 0
+
+
+def test_a_queue_crosses_the_line_as_engineers_measure_it() -> None:
+    """20 vehicles stand on each lane until it is green at 10 s: headways of front ends at the line, after the HCM.
+
+    Saturation headway is the mean of the fifth on; start-up lost time what the first four take beyond four of these.
+    """
+    task = make_task("approach", vehicles=40, cycle=200.0, green=100.0)
+    simulator, params = task.simulator.without("control"), task.params(torch.float64, "cpu")
+    params["signal"]["offset"] = torch.tensor(10.0, dtype=torch.float64)
+    place = LINE - 2.0 - 7.0 * torch.arange(20, dtype=torch.float64)  # 5 m and s0 each
+    lane = torch.arange(2).repeat_interleave(20)
+    state = simulator.state(place.repeat(2).unsqueeze(0), torch.zeros(1, 40).double(), params, lane=lane.unsqueeze(0),
+                            present=torch.ones(1, 40).double())  # fmt: skip
+    _, kept = simulator.rollout(state, {}, params, 700)
+    before = kept.position[:, 0, :] < LINE
+    last = before.sum(0) - 1  # row k is after step k + 1
+    here, speed = (x[:, 0, :].gather(0, last.unsqueeze(0))[0] for x in (kept.position, kept.speed))
+    crossed = (0.1 * (last + 1) + (LINE - here) / speed - 10.0).view(2, 20)
+    headway = torch.cat((crossed[:, :1], crossed.diff(dim=-1)), -1)
+    saturation = headway[:, 4:].mean(-1, keepdim=True)
+    flow, lost = 3600.0 / saturation, (headway[:, :4] - saturation).sum(-1)
+    assert bool(((flow > 1800.0) & (flow < 1900.0)).all()), flow
+    assert bool(((lost > 1.7) & (lost < 2.4)).all()), lost
+    assert float(kept.speed[:110].max()) < 0.05  # the first starts a second late
 
 
 @pytest.mark.parametrize("platoon", [0.4, 1.0])
