@@ -701,7 +701,9 @@ def curve(axes: Axes, rows: Sequence[Row], name: str, colour: str) -> None:
     axes.plot(spent, left.evaluate(spent), "|", color=colour, markersize=10)
 
 
-def picture(out: Path = OUT, path: Path = ROOT / "docs" / "agents_survival.png") -> None:
+def picture(
+    out: Path = OUT, path: Path = ROOT / "studies" / "2026-11-26-agents-measured" / "agents_survival.png"
+) -> None:
     """Draw the picture, a panel per task."""
     figure, panels = plt.subplots(1, len(TASKS), figsize=(10, 3.6), sharey=True, layout="constrained")
     for axes, (task, title) in zip(panels, TASKS.items(), strict=True):

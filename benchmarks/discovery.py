@@ -4,7 +4,7 @@ Every set is generated from a fresh seed by idm_env.data.synthetic, whose code s
 tool sees positions, speeds and lengths only. One line of JSON per set is kept, so that a run goes on where it stopped:
 
     python -m benchmarks.discovery --sets 2 --clean 100 --jobs 2 --out /tmp/discovery_benchmark.jsonl
-    python -m benchmarks.discovery --pictures docs    # those of docs/closing-the-loop.md, from data made here
+    python -m benchmarks.discovery --pictures docs    # those of docs/closing-the-loop.md and its study
 """
 
 from __future__ import annotations

@@ -66,13 +66,27 @@ sphinx_gallery_conf = {
 }
 
 
+PAGES = {
+    "idm_env/tasks/ring.py": "generated/tasks/ring.md",
+    "idm_env/tasks/features.py": "generated/features.md",
+    "idm_env/tasks/": "generated/environments.md",
+    "idm_env/effects/": "generated/effects.md",
+    "idm_env/cli/commands.py": "generated/commands.md",
+    "examples/first_hour.ipynb": "gallery/first_hour.rst",
+    "README.md": "index.md",
+}
+"""Where a link into the checkout leads on the site: to the page that is made from that file."""
+
+
 def setup(app: Any) -> None:
-    """Write the pages that come from code before anything is read, and mend what only GitHub understands."""
+    """Write the pages that come from code before anything is read, and let links into the checkout lead to them."""
     made_from_code.write(HERE)
     app.connect("source-read", _links)
 
 
 def _links(app: Any, name: str, text: list[str]) -> None:
-    """Let links to the README lead to the first page, and name studies, which are read in the checkout."""
-    text[0] = text[0].replace("](../README.md)", "](index.md)").replace("(../README.md#", "(index.md#")
+    """Replace links into the checkout by pages of the site, and name studies, which are read in the checkout."""
+    up = "../" * name.count("/")
+    for file, page in PAGES.items():
+        text[0] = text[0].replace(f"]({up}../{file}", f"]({up}{page}")
     text[0] = re.sub(r"\[([^]]+)\]\((?:\.\./)+(studies/[^)]+)\)", r"\1: `\2`", text[0])

@@ -1,4 +1,7 @@
-"""Pages that are made from the code at every build: tasks, effects, commands, reports, API; examples: gallery_of.py."""
+"""Pages that are made from the code at every build: tasks, effects, commands, API; examples: gallery_of.py.
+
+``python docs/made_from_code.py`` draws the pictures of docs/jobs/: what the commands' reports show of generated data.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,6 @@ def write(folder: Path) -> None:
         path = out / name
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
-    reports(out / "pictures")
     gallery_of.examples(ROOT)
 
 
@@ -423,7 +425,6 @@ def response(effect: Any, path: Path) -> bool:
 
 def commands() -> str:
     """Return every command with its options, as its help tells them."""
-    import click
     from typer.main import get_command
 
     from idm_env.cli.commands import app
@@ -441,7 +442,7 @@ def commands() -> str:
         for p in command.params:
             if getattr(p, "hidden", False) or p.name == "help":
                 continue
-            argument = isinstance(p, click.Argument) or p.param_type_name == "argument"
+            argument = p.param_type_name == "argument"
             names = f"`{p.name.upper()}`" if argument else " ".join(f"`{o}`" for o in (*p.opts, *p.secondary_opts))
             default = "–" if p.default is None or callable(p.default) else f"`{p.default}`"
             meaning = (getattr(p, "help", None) or "").replace("|", "\\|")
@@ -465,36 +466,45 @@ def api() -> dict[str, str]:
     return pages | {"api.rst": "\n".join([*index, ""])}
 
 
-def reports(pictures: Path) -> None:
-    """Run the commands on small generated data, unless there are pictures of them, and keep their reports' pictures."""
+def reports(folder: Path = ROOT / "docs" / "jobs") -> list[Path]:
+    """Run the commands on small generated data, and keep a picture of each report; return the files."""
     import base64
     import tempfile
 
+    from PIL import Image
+
     from idm_env.cli.commands import app
     from idm_env.data import synthetic
+    from idm_env.effects import Wander
     from idm_env.fitting.job import fit_file, simulate_file
     from idm_env.fitting.options import Options, Source
     from idm_env.trajectories.files import filter_file, reconstruct_file
 
-    if all((pictures / f"{name}-0.png").exists() for name in ("fit", "simulate", "filter", "reconstruct", "plot")):
-        return
-    app(
-        ["plot", str(ROOT / "configs" / "ring.yaml"), "--seconds", "600", "--out", str(pictures / "plot-0.png")],
-        standalone_mode=False,
-    )
+    ring = [str(ROOT / "configs" / "ring.yaml"), "--seconds", "600", "--out", str(folder / "plot.png")]
+    app(["plot", *ring], standalone_mode=False)
+    response(Wander(), folder / "wander.png")
     with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
+        out = Path(place)
         made, _ = synthetic.generate(3, runs=4, followers=2, seconds=60.0, noise=0.15)
         table = made.table.drop("gap_m", "gap_measured", "speed_mps")
-        table.write_csv(folder / "my.csv")
-        table.gather_every(10).write_csv(folder / "sparse.csv")
-        source = Source(folder / "my.csv", smooth=True)
-        fit_file(source, Options(starts=1, substeps=1), folder / "fit")
-        simulate_file(source, folder / "fit" / "model.yaml", folder / "simulate")
-        filter_file(folder / "my.csv", folder / "filter", baselines=False)
-        reconstruct_file(folder / "sparse.csv", folder / "reconstruct", baselines=False)
+        table.write_csv(out / "my.csv")
+        table.gather_every(10).write_csv(out / "sparse.csv")
+        source = Source(out / "my.csv", smooth=True)
+        fit_file(source, Options(starts=1, substeps=1), out / "fit")
+        simulate_file(source, out / "fit" / "model.yaml", out / "simulate")
+        filter_file(out / "my.csv", out / "filter", baselines=False)
+        reconstruct_file(out / "sparse.csv", out / "reconstruct", baselines=False)
         for name in ("fit", "simulate", "filter", "reconstruct"):
-            page = (folder / name / "report.html").read_text(encoding="utf-8")
+            page = (out / name / "report.html").read_text(encoding="utf-8")
             images = re.findall(r"data:image/png;base64,([^\"]+)", page)
             image = images[0] if name in ("fit", "simulate") else images[-1]
-            (pictures / f"{name}-0.png").write_bytes(base64.b64decode(image))
+            (folder / f"{name}.png").write_bytes(base64.b64decode(image))
+    written = [folder / f"{name}.png" for name in ("plot", "wander", "fit", "simulate", "filter", "reconstruct")]
+    for path in written:
+        Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)
+    return written
+
+
+if __name__ == "__main__":
+    for picture in reports():
+        print(picture)
