@@ -188,14 +188,14 @@ def processes_of(pool: ProcessPoolExecutor) -> list[BaseProcess]:
     return list((pool._processes or {}).values())
 
 
-def compile_error() -> type[Exception]:
-    """Return what ``torch.compile`` raises where it fails, such as without a C++ compiler.
+def compile_error() -> tuple[type[Exception], ...]:
+    """Return what ``torch.compile`` raises where it fails: without a C++ compiler, or at its eighth recompilation.
 
-    Why: torch has no public name for it. Tried: torch 2.13.0.
+    Why: torch has no public names for them. Tried: torch 2.11.0 and 2.13.0.
     """
-    import torch
+    from torch._dynamo import exc
 
-    return torch._dynamo.exc.TorchDynamoException
+    return exc.TorchDynamoException, getattr(exc, "FailOnRecompileLimitHit", exc.TorchDynamoException)
 
 
 def transforming() -> bool:

@@ -209,7 +209,7 @@ class Compiled(Simulator):
             first = str(error).strip().splitlines()[0]
             warnings.warn(
                 f"the step runs uncompiled, because torch.compile failed: {first} If no C++ compiler is "
-                "installed, g++, clang or MSVC cures it (triton for a GPU).",
+                "installed, g++, clang or MSVC cures it (triton for a GPU); after many shapes, dynamic=True.",
                 RuntimeWarning,
                 stacklevel=2,
             )

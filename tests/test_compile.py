@@ -113,3 +113,14 @@ def test_without_a_compiler_one_warning_and_the_same_values():
         second = compiled.step(first, {}, params)
     assert len([w for w in caught if issubclass(w.category, RuntimeWarning)]) == 1
     assert torch.equal(second.speed, simulator.step(simulator.step(state, {}, params), {}, params).speed)
+
+
+def test_more_shapes_than_torch_compiles_are_stepped_uncompiled_with_one_warning():
+    simulator = Simulator(Lane(), (IDM(), Brakes()))
+    compiled, params = simulator.compile(backend="eager"), simulator.defaults()
+    with pytest.warns(RuntimeWarning, match="dynamic=True") as caught:
+        for n in range(2, 14):
+            state = simulator.state(-30.0 * torch.arange(n), torch.full((n,), 10.0), params)
+            after = compiled.step(state, {}, params)
+            torch.testing.assert_close(after.speed, simulator.step(state, {}, params).speed)
+    assert len(caught) == 1

@@ -30,6 +30,7 @@ def rows(sizes: Sequence[int], rounds: int) -> dict[str, Any]:
     for vehicles in sizes:
         lanes = traffic.Traffic(vehicles, "cuda")
         for backward in (False, True):
+            torch.compiler.reset()  # type: ignore[no-untyped-call]
             case = lanes.ours(lanes.simulator.compile(), False, backward)
             times[f"rollout {vehicles} {_kind(backward)}"] = _least(case.run, rounds) / case.units
     for task, (keywords, counts) in FACES.items():
