@@ -171,8 +171,7 @@ def oracle(found: Any, truth: Any) -> float | None:
     The drivers' own parameters are fitted as they are for the tool's models.
     """
     from idm_env.data import hidden
-    from idm_env.discovery import crossed
-    from idm_env.discovery import model as terms
+    from idm_env.discovery import crossed, model as terms
 
     model, values = terms.Hypothesis(), []
     for name, strength in truth.effects.items():

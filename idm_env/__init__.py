@@ -15,20 +15,11 @@ from idm_env import backends
 __version__ = "0.1.0"
 
 _LAZY = {
-    "Simulator": "idm_env.simulator",
-    "Trajectory": "idm_env.simulator",
-    "Lane": "idm_env.roads",
-    "Lanes": "idm_env.roads",
-    "Ring": "idm_env.roads",
-    "State": "idm_env.types",
-    "Command": "idm_env.types",
-    "Record": "idm_env.types",
-    "Parameter": "idm_env.parameters",
-    "Effect": "idm_env.effects",
-    "IDM": "idm_env.effects",
-    "Brakes": "idm_env.effects",
-    "Control": "idm_env.effects",
-    "Replay": "idm_env.effects",
+    "effects": ("IDM", "Brakes", "Control", "Effect", "Replay"),
+    "parameters": ("Parameter",),
+    "roads": ("Lane", "Lanes", "Ring"),
+    "simulator": ("Simulator", "Trajectory"),
+    "types": ("Command", "Record", "State"),
 }
 
 _TASKS = (
@@ -89,8 +80,9 @@ backends.enter("idm_env.kernels.dispatch:rollout")
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
+    for module, names in _LAZY.items():
+        if name in names:
+            return getattr(importlib.import_module(f"idm_env.{module}"), name)
     if name == "plot":
         return importlib.import_module("idm_env.plot")
     raise AttributeError(f"module 'idm_env' has no attribute '{name}'")

@@ -35,8 +35,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from idm_env import effects as catalogue
-from idm_env import parameters
+from idm_env import effects as catalogue, parameters
 from idm_env.effects import CarFollowing, Effect
 from idm_env.extras import needed
 from idm_env.jobs import trust

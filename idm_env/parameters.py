@@ -21,9 +21,7 @@ from torch.distributions import biject_to, constraints
 from torch.distributions.transforms import Transform
 
 from idm_env.types import Params
-from idm_env.validation import nearest as nearest
-from idm_env.validation import one_of as one_of
-from idm_env.validation import shown
+from idm_env.validation import nearest as nearest, one_of as one_of, shown
 
 Role = Literal["strength", "shape", "threshold", "place"]
 V = TypeVar("V")
@@ -193,16 +191,5 @@ def replaced(params: Mapping[str, Mapping[str, V]], values: Mapping[str, V]) -> 
 
 def table(effects: Iterable[HasParameters]) -> list[dict[str, object]]:
     """Return one row per parameter for docs and reports."""
-    return [
-        {
-            "parameter": full,
-            "symbol": p.symbol,
-            "unit": p.unit,
-            "default": p.default,
-            "low": p.low,
-            "high": p.high,
-            "null": p.null,
-            "role": p.role,
-        }
-        for full, p in catalogue(effects).items()
-    ]
+    columns = ("symbol", "unit", "default", "low", "high", "null", "role")
+    return [{"parameter": full, **{n: getattr(p, n) for n in columns}} for full, p in catalogue(effects).items()]

@@ -16,8 +16,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 import idm_env  # noqa: F401
 from agents import apg, common

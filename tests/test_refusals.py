@@ -11,8 +11,7 @@ from typing import Any, get_args
 import pytest
 import typer
 
-from idm_env.cli import commands as cli
-from idm_env.cli import refusals
+from idm_env.cli import commands as cli, refusals
 from idm_env.effects import BASES
 from idm_env.fitting.fit import Method
 from idm_env.fitting.problem import Loss, Objective

@@ -116,8 +116,7 @@ def demo(
     names = (*EXPLAINED, *(("platoon.csv",) if data is None else ()))
     with storage.results(out, names, [data]) as folder, shown(console) as report:
         from idm_env.data import synthetic
-        from idm_env.discovery.sets import Question
-        from idm_env.discovery.sets import explain as explain_one
+        from idm_env.discovery.sets import Question, explain as explain_one
 
         _work_begins()
         path = data
@@ -431,8 +430,7 @@ def explain(
             if cure is not None:
                 answers.undecided(undecided.write(read, cure, out, files), out)
                 return
-        from idm_env.discovery.sets import Question, explain_sets
-        from idm_env.discovery.sets import explain as explain_one
+        from idm_env.discovery.sets import Question, explain as explain_one, explain_sets
 
         question = Question(
             by, candidates, inputs, seed, file.ring_length, file.place, file.layout,

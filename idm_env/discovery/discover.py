@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from idm_env.data import Trajectories, episodes
-from idm_env.discovery import calibrate, judge, march, records, search
-from idm_env.discovery import model as terms
+from idm_env.discovery import calibrate, judge, march, model as terms, records, search
 from idm_env.discovery.finish import Discovery, finished
 from idm_env.discovery.judgement import Evaluation
 from idm_env.discovery.model import Hypothesis, Term

@@ -11,8 +11,19 @@ import numpy as np
 
 from idm_env.data import Trajectories
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import bases, ceilings, fleet, found, judge, places, replica, shared, summary, tails
-from idm_env.discovery import model as terms
+from idm_env.discovery import (
+    bases,
+    ceilings,
+    fleet,
+    found,
+    judge,
+    model as terms,
+    places,
+    replica,
+    shared,
+    summary,
+    tails,
+)
 from idm_env.discovery.compare import compare
 from idm_env.discovery.judgement import Evaluation, Judgement, judgement_of
 from idm_env.discovery.model import Hypothesis

@@ -8,8 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from idm_env.discovery import bases, calibrate, closed_loop, crossed, judge, words
-from idm_env.discovery import ladder as ladders
+from idm_env.discovery import bases, calibrate, closed_loop, crossed, judge, ladder as ladders, words
 from idm_env.discovery.compare import Comparison, compare
 from idm_env.discovery.fleet import Kinds, is_worth
 from idm_env.discovery.ladder import Ladder

@@ -11,8 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm as normal
-from scipy.stats import t as student
+from scipy.stats import norm as normal, t as student
 
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.records import Records, Rows, windows

@@ -21,11 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from idm_env import delay_buffer
-from idm_env import effects as known
+from idm_env import delay_buffer, effects as known
 from idm_env.discovery import march_loops
-from idm_env.discovery.slots import SETS, TARGETS, Push
-from idm_env.discovery.slots import Slot as Changed
+from idm_env.discovery.slots import SETS, TARGETS, Push, Slot as Changed
 from idm_env.effects import IDM, Brakes, CarFollowing, Effect
 from idm_env.effects.free import FEATURES, PER
 from idm_env.parameters import Parameter

@@ -9,9 +9,7 @@ from itertools import product
 import numpy as np
 import torch
 
-from idm_env.discovery import calibrate, judge, places
-from idm_env.discovery import model as terms
-from idm_env.discovery import noise as noises
+from idm_env.discovery import calibrate, judge, model as terms, noise as noises, places
 from idm_env.discovery.calibrate import Calibrated, population
 from idm_env.discovery.closed_loop import ClosedLoopFit
 from idm_env.discovery.model import Hypothesis, Term

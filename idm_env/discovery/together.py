@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from idm_env.discovery import closed_loop, judge
-from idm_env.discovery import model as terms
+from idm_env.discovery import closed_loop, judge, model as terms
 from idm_env.discovery.closed_loop import ClosedLoopFit, Line
 from idm_env.discovery.model import Term
 from idm_env.discovery.score import ALPHA, CLOSED_LOOP_SHARE, Tested, at_level, interval_of, westfall_young

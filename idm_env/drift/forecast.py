@@ -116,6 +116,3 @@ def covers(drawn: np.ndarray, truth: np.ndarray, share: float) -> tuple[np.ndarr
     """Return whether the central band of ``share`` of the draws holds the truth, and the band's width."""
     low, high = np.quantile(drawn, [0.5 - 0.5 * share, 0.5 + 0.5 * share], axis=0)
     return (truth >= low) & (truth <= high), high - low
-
-
-__all__ = ["covers", "crps", "draw_gaps", "followed", "log_score"]

@@ -92,16 +92,7 @@ class PowerLimit(Effect):
     sees_truth: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            "power",
-            "P/m",
-            "W/kg",
-            15.0,
-            2.0,
-            100.0,
-            null=1e5,
-            role="threshold",
-            starts=(10.0, 18.0),
-            searched=(2.0, 60.0),
+            "power", "P/m", "W/kg", 15.0, 2.0, 100.0, 1e5, role="threshold", starts=(10.0, 18.0), searched=(2.0, 60.0)
         ),
     )
 

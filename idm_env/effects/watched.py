@@ -147,6 +147,3 @@ class _Limited:
     def pushed(self, scene: Scene) -> Any:
         """Return the buffer after this step."""
         return self.past.pushed(scene)
-
-
-__all__ = ["RETURNS", "watched"]

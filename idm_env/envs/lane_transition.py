@@ -350,6 +350,3 @@ class LaneTransition(CompiledTransition):
             between, more = turn.through(bound.still, lanes.turned, step, moment.begins[:2], between)
             on_parameters += more
         return on + between  # type: ignore[no-any-return]
-
-
-__all__ = ["Crossing", "LaneTransition"]

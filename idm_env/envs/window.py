@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -349,25 +349,18 @@ class Tape:
                 on_seen[part], on_last[part], on_action[part], acted[part], on_observation, looked, total, recalled,
                 on_later, remembers, each, parameters,
             )  # fmt: skip
-            free = list(sums)
-
-            def some(
-                begin: int,
-                end: int,
-                see: Any = see,
-                shared: Any = shared,
-                arrays: Any = arrays,
-                free: Any = free,
-                part: Any = part,
-            ) -> None:
-                own = {n: address(x) for n, x in free.pop().items()}
-                window_back(
-                    driver.backward.call, _columns(driver.backward, see | own, part), *shared, begin, end, *arrays
-                )
-
+            some = partial(_rows_back, driver.backward, list(sums), see, part, shared, arrays)
             pool.split(some, self._blocks, 1, threads)
         summed = {n: sum((x[n] for x in sums[1:]), sums[0][n]) for n in sums[0]}
         return two[0], pasts[0], parameters, acted, {**summed, "seen": total, "hidden": recalled}
+
+
+def _rows_back(
+    loops: PolicyRows, free: list[Any], see: Mapping[str, Any], part: slice, shared: Any, arrays: Any, *span: int
+) -> None:
+    """Go back over a span of blocks with sums that no other thread has taken."""
+    own = {n: address(x) for n, x in free.pop().items()}
+    window_back(loops.call, _columns(loops, {**see, **own}, part), *shared, *span, *arrays)
 
 
 class _Window(torch.autograd.Function):

@@ -18,8 +18,7 @@ from torch import Tensor
 from idm_env.data import DataError, Episode
 from idm_env.data.samples import VEHICLES, Samples
 from idm_env.simulator import Simulator
-from idm_env.types import Adjacent, Inputs, Params, State
-from idm_env.types import Record as Replayed
+from idm_env.types import Adjacent, Inputs, Params, Record as Replayed, State
 
 INTEGRATION_STEP_S = 0.025
 """Largest step (s) by which measured data are simulated: at 0.1 s the first-order error of a step biases parameters

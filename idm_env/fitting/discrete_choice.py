@@ -310,9 +310,3 @@ def per_vehicle(decisions: Decisions, value: Tensor) -> Tensor:
     sums = torch.zeros(count, dtype=value.dtype).index_add(0, decisions.vehicle, value)
     some = torch.zeros(count, dtype=torch.bool).index_fill(0, decisions.vehicle, True)
     return sums[some]
-
-
-__all__ = [
-    "TEMPERATURE", "Choice", "Chosen", "ConstantRate", "GapLogit", "HeldOut", "UtilityLogit", "fit_choice", "folds",
-    "held_out", "per_vehicle",
-]  # fmt: skip

@@ -20,8 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from idm_env.delay_buffer import PAST
 from idm_env.effects.base import Effect
-from idm_env.kernels import driver_loops as loops
-from idm_env.kernels import threads as pool
+from idm_env.kernels import driver_loops as loops, threads as pool
 from idm_env.kernels.lanes import part_of
 from idm_env.kernels.printed import HEADER
 from idm_env.kernels.tiles import Array
@@ -396,6 +395,3 @@ class _Rollout(torch.autograd.Function):
     def backward(ctx: Any, *seeds: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         gradients = ctx.behind._backward(ctx.saved_tensors, ctx.tape, seeds, ctx.every)
         return None, None, *gradients
-
-
-__all__ = ["BehindRecord", "DriverKernel", "prepared"]

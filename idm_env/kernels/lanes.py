@@ -20,8 +20,7 @@ from torch import Tensor
 
 from idm_env.backends import off
 from idm_env.delay_buffer import PAST
-from idm_env.kernels import lane_adjoint, lane_loops, tiles
-from idm_env.kernels import threads as pool
+from idm_env.kernels import lane_adjoint, lane_loops, threads as pool, tiles
 from idm_env.kernels.memory import addresses
 from idm_env.kernels.operands import dense, operand, reduced, table
 from idm_env.kernels.printed import TileKernel

@@ -187,6 +187,3 @@ def prefetch(typing_context: Any, source: Any, at: Any, n: Any, like: Any) -> An
         return context.get_dummy_value()
 
     return types.void(types.int64, types.int64, types.int64, like), generate
-
-
-__all__ = ["LINE", "add", "addresses", "copy", "copy_truth", "fill", "gather", "located", "number", "prefetch"]

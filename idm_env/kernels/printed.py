@@ -71,18 +71,11 @@ class TileKernel:
         self.measures = _measures(text)
         self.read = np.array(text.indices(text.read), np.int64)
         self.looks = _flat(text.looks(), ("static", *PHASES))
-        self.recalls = np.array(
-            [
-                (
-                    text.at(f"AGO_{r.ago}") * ROW,
-                    r.signal,
-                    text.at(row(r.slot)) * ROW,
-                    text.at(f"ON_{row(r.slot)}") * ROW,
-                )
-                for r in program.recalls
-            ],
-            np.int64,
-        ).reshape(-1, 4)
+        recalls = []
+        for r in program.recalls:
+            ago, to, on = (text.at(name) * ROW for name in (f"AGO_{r.ago}", row(r.slot), f"ON_{row(r.slot)}"))
+            recalls.append((ago, r.signal, to, on))
+        self.recalls = np.array(recalls, np.int64).reshape(-1, 4)
 
     @cached_property
     def _backward(self) -> tuple[str, tuple[str, ...]]:
@@ -194,6 +187,3 @@ def _tile_kernel(simulator: CarFollowingStep, form: Form) -> TileKernel:
     road, names = type(simulator.road).__name__.lower(), ", ".join(e.name for e in simulator.effects)
     title = f"One step of {names} on a {road}, {simulator.integration}."
     return TileKernel(program, TileText(program, ring=simulator.road.around, flags=form.flags), title)
-
-
-__all__ = ["MEASURES", "TileKernel", "printed", "tile_kernel"]

@@ -15,6 +15,3 @@ def before(stepping: CarFollowingStep, state: State, inputs: Inputs, params: Par
     if state.present is not None:
         state = turnover(stepping, state, params)
     return decided(stepping, state, inputs, params) if stepping.lane_change_models else state
-
-
-__all__ = ["before"]

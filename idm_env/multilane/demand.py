@@ -273,6 +273,3 @@ def _placed(stepping: CarFollowingStep, state: State, params: Params, entry: _En
         moving = (torch.where(new, x, y) for x, y in zip(standing(begun), after.moving, strict=True))
         after = after._replace(moving=Moving(*moving))
     return begun._replace(memory=memory, lanes=after)
-
-
-__all__ = ["Counts", "counts", "due", "spread", "trips", "turnover", "waiting"]

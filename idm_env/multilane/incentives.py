@@ -168,6 +168,3 @@ def _one_side(
         without_me=his(now) * behind.present,
         ends=ends,
     )
-
-
-__all__ = ["NOW", "lane_scene", "seen_merging", "wished"]

@@ -41,6 +41,3 @@ def decided(stepping: CarFollowingStep, state: State, inputs: Inputs, params: Pa
     if stepping.sees_mergers:
         after = seen_merging(view, after, view.mergers(state, sides, claim), due)
     return on_lanes(after)
-
-
-__all__ = ["decided"]

@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from scipy.stats import norm, qmc
 
-from idm_env.data import Episode
-from idm_env.data import VehicleRecord as Recorded
+from idm_env.data import Episode, VehicleRecord as Recorded
 from idm_env.fitting.fit import fit
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.solver import normal

@@ -52,15 +52,8 @@ def _pow(graph: Graph, node: Node, g: Node) -> list[Share]:
 
 
 def _abs(graph: Graph, node: Node, g: Node) -> list[Share]:
-    zero = graph.constant(0.0)
-    return [
-        (
-            0,
-            graph.select(
-                graph.compare("gt", node.args[0], zero), g, _masked(graph, "lt", node.args[0], zero, graph.neg(g))
-            ),
-        )
-    ]
+    (x,), zero = node.args, graph.constant(0.0)
+    return [(0, graph.select(graph.compare("gt", x, zero), g, _masked(graph, "lt", x, zero, graph.neg(g))))]
 
 
 def _select(graph: Graph, node: Node, g: Node) -> list[Share]:

@@ -5,8 +5,8 @@ The loops are ``kernels/driver_loops.py``, which contain no equation; a ``RowLay
 
 from __future__ import annotations
 
+from collections import namedtuple
 from functools import cached_property
-from typing import NamedTuple
 
 from idm_env.scalar.driver import DriverProgram, Tangents
 from idm_env.scalar.graph import Leaf, Node
@@ -22,39 +22,16 @@ ADJOINT = ("hoist_back", "sense_back", "respond_back")
 """Adjoints of a step's phases."""
 
 
-class RowLayout(NamedTuple):
-    """Where a loop finds everything: first indices of groups of rows in the workspace, and how many rows they have.
+RowLayout = namedtuple(
+    "RowLayout",
+    "size states n_states statics n_statics records n_records agos n_agos past n_past signals n_signals "
+    "blocks block n_blocks tangent_signals n_moving_signals tangent_past on_states n_moving on_parameters "
+    "n_parameters on_hoisted n_hoisted on_past on_signals",
+)
+"""Where a loop finds everything: first indices of groups of rows in the workspace, and how many rows they have.
 
-    A direction's tangents are a block of rows of its own: of states (gap and speed first), signals and the past.
-    """
-
-    size: int
-    states: int
-    n_states: int
-    statics: int
-    n_statics: int
-    records: int
-    n_records: int
-    agos: int
-    n_agos: int
-    past: int
-    n_past: int
-    signals: int
-    n_signals: int
-    blocks: int
-    block: int
-    n_blocks: int
-    tangent_signals: int
-    n_moving_signals: int
-    tangent_past: int
-    on_states: int
-    n_moving: int
-    on_parameters: int
-    n_parameters: int
-    on_hoisted: int
-    n_hoisted: int
-    on_past: int
-    on_signals: int
+A direction's tangents are a block of rows of its own: of states (gap and speed first), signals and the past.
+"""
 
 
 def _named(name: str) -> str:
@@ -88,15 +65,10 @@ class DriverText:
             self._group("on_signals", [f"ON_SIGNAL_{i}" for i in p.signals])
         self._group("fixed", [_named(f"fixed{i}") for i in range(len(self.tangents.hoist))])
         self._group("slopes", [_named(f"slope {i}") for i in range(len(self.tangents.slopes))])
-        self._block = {
-            name: i
-            for i, name in enumerate(
-                [_named(f"tangent {n}") for n in p.moving]
-                + [f"SOURCE_{i}" for i in range(self.tangents.targets)]
-                + [f"TANGENT_SIGNAL_{i}" for i in self.tangents.sense]
-                + [f"TANGENT_PAST_{i}" for i, _ in self.moving_past]
-            )
-        }
+        block = [_named(f"tangent {n}") for n in p.moving] + [f"SOURCE_{i}" for i in range(self.tangents.targets)]
+        block += [f"TANGENT_SIGNAL_{i}" for i in self.tangents.sense]
+        block += [f"TANGENT_PAST_{i}" for i, _ in self.moving_past]
+        self._block = {name: i for i, name in enumerate(block)}
         self._directions = directions
         self._phases = self._all(adjoint)
 
@@ -137,18 +109,12 @@ class DriverText:
         """Return rows and phases; ``constants`` are complete then."""
         names = [(name, f"{i} * ROW") for i, name in enumerate(self._rows)]
         names += [(f"OF_{name}", f"{i} * ROW") for name, i in self._block.items()]
-        functions = [
-            function(
-                name,
-                doc,
-                body(writes, self._read, self.constants),
-                compiler,
-                ("w", "h") if compiler == "beside" else ("w",),
-            )
-            for name, (doc, writes, compiler) in self._phases.items()
-            if writes
-        ]
-        return "\n\n".join([assignments(names), *functions])
+        texts = [assignments(names)]
+        for name, (doc, writes, compiler) in self._phases.items():
+            if writes:
+                takes = ("w", "h") if compiler == "beside" else ("w",)
+                texts.append(function(name, doc, body(writes, self._read, self.constants), compiler, takes))
+        return "\n\n".join(texts)
 
     def _all(self, adjoint: bool) -> dict[str, tuple[str, list[Write], str]]:
         p, tangents = self.program, self.tangents
@@ -156,26 +122,17 @@ class DriverText:
         hoist += _writes([(f"AGO_{i}", x) for i, x in enumerate(p.agos)])
         slopes = _writes([(_named(f"slope {i}"), x) for i, x in enumerate(tangents.slopes)])
         slopes += [Write(f"w[{self._source(*place)} + j]", x) for place, x in tangents.sources.items()]
-        phases: dict[str, tuple[str, list[Write], str]] = {
+        fixed = _writes([(_named(f"fixed{i}"), x) for i, x in enumerate(tangents.hoist)])
+        signals = [Write(f"h[OF_TANGENT_SIGNAL_{i} + j]", x) for i, x in tangents.sense.items()]
+        carry = [Write(f"h[OF_{_named(f'tangent {n}')} + j]", x) for n, x in tangents.carry.items()]
+        phases = {
             "hoist": ("What depends on parameters alone.", hoist, "exact"),
             "sense": ("What the past keeps.", _writes([(f"SIGNAL_{i}", x) for i, x in p.sense.items()]), "exact"),
             "respond": ("States after the step.", _writes([(_named(n), x) for n, x in p.after.items()]), "exact"),
-            "fix": (
-                "Slopes that depend on parameters alone.",
-                _writes([(_named(f"fixed{i}"), x) for i, x in enumerate(tangents.hoist)]),
-                "swift",
-            ),
+            "fix": ("Slopes that depend on parameters alone.", fixed, "swift"),
             "linearise": ("Slopes of a step.", slopes, "swift"),
-            "carry_sense": (
-                "What the past keeps of one direction.",
-                [Write(f"h[OF_TANGENT_SIGNAL_{i} + j]", x) for i, x in tangents.sense.items()],
-                "beside",
-            ),
-            "carry": (
-                "Tangents of one direction after the step.",
-                [Write(f"h[OF_{_named(f'tangent {n}')} + j]", x) for n, x in tangents.carry.items()],
-                "beside",
-            ),
+            "carry_sense": ("What the past keeps of one direction.", signals, "beside"),
+            "carry": ("Tangents of one direction after the step.", carry, "beside"),
         }
         return phases | (self._back() if adjoint else {})
 
@@ -206,6 +163,3 @@ def _writes(pairs: list[tuple[str, Node]]) -> list[Write]:
 
 def _added(nodes: dict[str, Node]) -> list[Write]:
     return [Write(f"w[{_named(f'on {name}')} + j]", node, adds=True) for name, node in nodes.items()]
-
-
-__all__ = ["ADJOINT", "TANGENTS", "VALUES", "DriverText", "RowLayout"]

@@ -18,7 +18,7 @@ from idm_env.roads.base import Road
 from idm_env.roads.chains import Chains
 from idm_env.roads.ends import Ending
 from idm_env.scalar.graph import Graph, Node, TimeStep
-from idm_env.scalar.scalar import Scalar, Unordered, Untraceable, static, value_of
+from idm_env.scalar.scalar import Scalar, Unordered as Unordered, Untraceable as Untraceable, static, value_of
 from idm_env.step import CarFollowingStep
 from idm_env.types import Motion, Scene, State
 
@@ -240,16 +240,9 @@ def state_of(form: Form, graph: Graph) -> State:
     def read(name: str) -> Any:
         return Scalar(graph, graph.input(name))
 
-    return State(
-        position=read("position"),
-        speed=read("speed"),
-        accel=read("accel"),
-        gap=read("gap"),
-        length=read("length"),
-        step=read("step"),
-        present=read("present") if form.present else None,
-        memory={name: read(f"memory of {name}") for name in form.memories},
-    )
+    memory = {name: read(f"memory of {name}") for name in form.memories}
+    numbers = {name: read(name) for name in ("position", "speed", "accel", "gap", "length", "step")}
+    return State(**numbers, present=read("present") if form.present else None, memory=memory)
 
 
 def inputs_of_form(form: Form, graph: Graph) -> dict[str, Any]:
@@ -275,17 +268,3 @@ class _Parts:
 
     def __iter__(self) -> Iterator[Any]:
         return iter(self._values.values())
-
-
-__all__ = [
-    "Form",
-    "Parameters",
-    "Recording",
-    "SeenRoad",
-    "Unordered",
-    "Untraceable",
-    "inputs_of_form",
-    "record",
-    "slot_name",
-    "state_of",
-]

@@ -299,6 +299,3 @@ def value_of(graph: Graph, x: Any) -> Node:
 def static(graph: Graph, name: str) -> Scalar:
     """Return a parameter."""
     return Scalar(graph, graph.input(name, level=STATIC))
-
-
-__all__ = ["FUNCTIONS", "Scalar", "Untraceable", "static", "value_of"]

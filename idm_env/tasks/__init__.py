@@ -7,36 +7,28 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from idm_env.jobs import trust
-from idm_env.tasks.approach import ApproachTask
-from idm_env.tasks.base import EnvState, Task
-from idm_env.tasks.checks import KeywordError
-from idm_env.tasks.features import FEATURES, AgentView, Feature
-from idm_env.tasks.follow import FollowTask
-from idm_env.tasks.highway import HighwayTask
-from idm_env.tasks.open_roads import BottleneckTask, MergeTask, OpenHighwayTask
-from idm_env.tasks.platoon import PlatoonTask
-from idm_env.tasks.random import Draw
-from idm_env.tasks.replay import ReplayTask
-from idm_env.tasks.replay_lanes import ReplayLanesTask
-from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition
-from idm_env.tasks.ring import RingTask
+from idm_env.tasks.approach import ApproachTask as ApproachTask
+from idm_env.tasks.base import EnvState as EnvState, Task as Task
+from idm_env.tasks.checks import KeywordError as KeywordError
+from idm_env.tasks.features import FEATURES as FEATURES, AgentView as AgentView, Feature as Feature
+from idm_env.tasks.follow import FollowTask as FollowTask
+from idm_env.tasks.highway import HighwayTask as HighwayTask
+from idm_env.tasks.open_roads import (
+    BottleneckTask as BottleneckTask,
+    MergeTask as MergeTask,
+    OpenHighwayTask as OpenHighwayTask,
+)
+from idm_env.tasks.platoon import PlatoonTask as PlatoonTask
+from idm_env.tasks.random import Draw as Draw
+from idm_env.tasks.replay import ReplayTask as ReplayTask
+from idm_env.tasks.replay_lanes import ReplayLanesTask as ReplayLanesTask
+from idm_env.tasks.reward_terms import REWARD_TERMS as REWARD_TERMS, RewardTerm as RewardTerm, Transition as Transition
+from idm_env.tasks.ring import RingTask as RingTask
 from idm_env.validation import nearest, shown
 
-TASKS: dict[str, type[Task]] = {
-    task.name: task
-    for task in (
-        RingTask,
-        FollowTask,
-        PlatoonTask,
-        ReplayTask,
-        ReplayLanesTask,
-        HighwayTask,
-        OpenHighwayTask,
-        MergeTask,
-        BottleneckTask,
-        ApproachTask,
-    )
-}
+_TASKS: list[type[Task]] = [RingTask, FollowTask, PlatoonTask, ReplayTask, ReplayLanesTask, HighwayTask]
+_TASKS += [OpenHighwayTask, MergeTask, BottleneckTask, ApproachTask]
+TASKS = {task.name: task for task in _TASKS}
 
 
 def make_task(task: str = "ring", *, trusted: bool = False, **choices: Any) -> Task:
@@ -63,30 +55,3 @@ def task_with(task: str, choices: Mapping[str, Any], others: Iterable[str] = ())
             like = nearest(str(choice), [name for name in (*names, *others) if name != choice])
             raise KeywordError(f"task '{task}' got an unexpected keyword argument {shown(choice)}.{like}")
     return TASKS[task](**choices)
-
-
-__all__ = [
-    "FEATURES",
-    "REWARD_TERMS",
-    "TASKS",
-    "AgentView",
-    "ApproachTask",
-    "BottleneckTask",
-    "Draw",
-    "EnvState",
-    "Feature",
-    "FollowTask",
-    "HighwayTask",
-    "KeywordError",
-    "MergeTask",
-    "OpenHighwayTask",
-    "PlatoonTask",
-    "ReplayLanesTask",
-    "ReplayTask",
-    "RewardTerm",
-    "RingTask",
-    "Task",
-    "Transition",
-    "make_task",
-    "task_with",
-]

@@ -24,8 +24,7 @@ from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import RewardTerm, Transition
 from idm_env.tasks.said_roads import STANDS, DriverClass, Loop, classes_of, lengths, loops_of, rules_of, with_classes
 from idm_env.tasks.starting_places import with_room
-from idm_env.tasks.trip_table import KEYS, TripTable, read, spread
-from idm_env.tasks.trip_table import table as made
+from idm_env.tasks.trip_table import KEYS, TripTable, read, spread, table as made
 from idm_env.types import ENTRY_SPEED, Params, State, Trips
 from idm_env.validation import at_least, nearest, shown
 

@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-from idm_env.wrappers.fitting import ParameterFitting
+from idm_env.wrappers.fitting import ParameterFitting as ParameterFitting
 from idm_env.wrappers.statistics import (
-    NormalizeObservation,
-    RecordEpisodeStatistics,
-    VectorNormalizeObservation,
-    VectorRecordEpisodeStatistics,
+    NormalizeObservation as NormalizeObservation,
+    RecordEpisodeStatistics as RecordEpisodeStatistics,
+    VectorNormalizeObservation as VectorNormalizeObservation,
+    VectorRecordEpisodeStatistics as VectorRecordEpisodeStatistics,
 )
-
-__all__ = [
-    "NormalizeObservation",
-    "ParameterFitting",
-    "RecordEpisodeStatistics",
-    "VectorNormalizeObservation",
-    "VectorRecordEpisodeStatistics",
-]

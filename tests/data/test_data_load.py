@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from idm_env.data import DataError, Trajectories, episodes, folder, load, schema
 from idm_env.trajectories.files import filter_file

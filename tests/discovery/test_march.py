@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from idm_env.discovery import march
-from idm_env.discovery import model as terms
+from idm_env.discovery import march, model as terms
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis, Term

@@ -14,8 +14,7 @@ import torch
 
 from idm_env import effects as catalogue
 from idm_env.data import Trajectories, synthetic
-from idm_env.discovery import discover, march, places
-from idm_env.discovery import model as terms
+from idm_env.discovery import discover, march, model as terms, places
 from idm_env.discovery.model import Hypothesis, simple
 from idm_env.discovery.records import Records
 from idm_env.effects import Effect

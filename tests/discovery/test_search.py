@@ -12,8 +12,7 @@ import torch
 from scipy.stats import t as student
 
 from idm_env.data import episodes, synthetic
-from idm_env.discovery import model as terms
-from idm_env.discovery import search, selection
+from idm_env.discovery import model as terms, search, selection
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows

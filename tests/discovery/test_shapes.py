@@ -11,8 +11,7 @@ import torch
 
 from benchmarks import discovery as sets
 from idm_env.data import synthetic
-from idm_env.discovery import Discovery, crossed, discover, found, write_report
-from idm_env.discovery import model as terms
+from idm_env.discovery import Discovery, crossed, discover, found, model as terms, write_report
 from idm_env.discovery.compare import ERRORS
 from idm_env.discovery.march import PULSED, Catalogue
 from idm_env.discovery.model import Hypothesis

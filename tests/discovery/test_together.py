@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from idm_env.data import episodes, synthetic
-from idm_env.discovery import closed_loop, search, selection, together
-from idm_env.discovery import model as terms
+from idm_env.discovery import closed_loop, model as terms, search, selection, together
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import gather, windows

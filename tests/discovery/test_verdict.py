@@ -19,13 +19,13 @@ from idm_env.discovery import (
     crossed,
     discover,
     judge,
+    model as terms,
+    page as pages,
     together,
     verdict,
     words,
     write_report,
 )
-from idm_env.discovery import model as terms
-from idm_env.discovery import page as pages
 from idm_env.discovery.bases import Law, best_of
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.compare import ERRORS, Comparison, ErrorChange

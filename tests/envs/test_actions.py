@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 import idm_env  # noqa: F401
-from idm_env.envs.pettingzoo import env as turns
-from idm_env.envs.pettingzoo import parallel_env
+from idm_env.envs.pettingzoo import env as turns, parallel_env
 
 pytest.importorskip("stable_baselines3")
 

@@ -14,8 +14,7 @@ from idm_env.envs.values import Values
 from idm_env.kernels.rows import RowFunction
 from idm_env.scalar.record import Untraceable
 from idm_env.simulator import Simulator
-from tests.envs.test_step_gradients import CASES as LANES
-from tests.envs.test_step_gradients import DECLARED, WEIGHTS
+from tests.envs.test_step_gradients import CASES as LANES, DECLARED, WEIGHTS
 
 pytest.importorskip("numba")
 

@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from idm_env.effects import IDM, Brakes, Control, Noise, Replay, make
 from idm_env.kernels import dispatch, lane_loops, lanes, tiles

@@ -6,8 +6,7 @@ import dataclasses
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from torch import Tensor
 
 from idm_env.effects import IDM, Brakes, Effect, LaneCommand, MandatoryChange, Mobil, make

@@ -6,8 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import Phase, example, given, settings
-from hypothesis import strategies as st
+from hypothesis import Phase, example, given, settings, strategies as st
 from torch import Tensor
 
 from idm_env.effects import IDM, Brakes, MandatoryChange, Mobil, make

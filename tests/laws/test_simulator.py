@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from idm_env.effects import ALL, BASES, IDM, Brakes, Lag, make
 from idm_env.roads import Lane, Ring

@@ -3,8 +3,7 @@
 import gymnasium as gym
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import idm_env  # noqa: F401
 from idm_env.tasks import Draw, make_task

@@ -14,8 +14,7 @@ import torch
 
 from idm_env.model_file import load_environment
 from idm_env.multilane import demand
-from idm_env.tasks import Draw, Task, make_task
-from idm_env.tasks import trip_table as table
+from idm_env.tasks import Draw, Task, make_task, trip_table as table
 from idm_env.tasks.open_roads import OpenHighwayTask
 from idm_env.tasks.said_roads import KEYS
 from idm_env.types import Command, Trips
