@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from idm_env.envs.batch import Batch
+from idm_env.envs.policy_call import NO_NUMBERS, policy_outputs
 from idm_env.kernels import dispatch
 from idm_env.scalar.record import Untraceable
 
@@ -40,14 +41,13 @@ def unroll(
     batch: Batch, policy: Callable[..., Any], steps: int, push: Tensor | None, hidden: Tensor | None
 ) -> Unrolled:
     """Return a window of steps; see ``Face.unroll``. ValueError for a policy whose actions have another shape."""
-    task, values = batch.task, batch.values
+    task, values, dtype = batch.task, batch.values, batch.settings.dtype
     shape = (batch.count, len(task.agents) * len(task.commands))
-    extra = torch.zeros(shape, dtype=batch.settings.dtype) if push is None else push.expand(shape).contiguous()
-    if hidden is not None and (len(hidden) != batch.count or hidden.dtype != extra.dtype):
-        raise ValueError(
-            f"hidden has shape {tuple(hidden.shape)} and {hidden.dtype}. Give one row for each of {batch.count} "
-            f"environments, in {extra.dtype}."
-        )
+    extra = _per_environment("push", torch.zeros(shape) if push is None else push, shape).to(dtype).contiguous()
+    if hidden is not None:
+        hidden = _per_environment("hidden", hidden, (batch.count, *np.shape(hidden)[1:]))
+    if hidden is not None and hidden.dtype != dtype:
+        raise ValueError(f"hidden has {hidden.dtype}, and the environments have {dtype}. Give it in {dtype}.")
     # On several lanes, and where actions are held, a window is its steps, each of which is compiled.
     fits = task.held == 1 and task.road.outline is None and not task.simulator.untried
     if fits and values is not None and dispatch.surroundings() is None:
@@ -61,18 +61,16 @@ def unroll(
         except Untraceable:
             pass
     columns: list[tuple[Tensor, ...]] = []
-    seen = batch.seen()
+    seen = batch.seen().clone()  # a policy may write to it
     first = [seen]
     for _ in range(steps):
-        if hidden is None:
-            action = policy(seen) + extra
-        else:
-            action, hidden = policy(seen, hidden)
-            action = action + extra
-        if action.shape != shape or not bool(action.isfinite().all()):
-            raise ValueError(
-                f"policy gives actions of shape {tuple(action.shape)}; finite ones of shape {shape} are needed."
-            )
+        inputs = {"seen": seen} if hidden is None else {"seen": seen, "hidden": hidden}
+        action, *later = policy_outputs(policy, inputs, shape[1])
+        hidden = next(iter(later), None)
+        for name, x in (("actions", action), ("hidden numbers", hidden)):
+            if x is not None and not bool(x.isfinite().all()):
+                raise ValueError(NO_NUMBERS.format(name))
+        action = (action if action.dtype == dtype else action.clamp(-1.0, 1.0).to(dtype)) + extra
         outcome = batch.step(action)
         seen = final = outcome.observation.reshape(batch.count, -1)
         over = np.flatnonzero((outcome.whole.terminated | outcome.whole.truncated).numpy())
@@ -83,3 +81,17 @@ def unroll(
         columns.append((action, *outcome.whole, final))
     action, reward, terminated, truncated, final = (torch.stack(x) for x in zip(*columns, strict=True))
     return Unrolled(torch.stack(first), action, reward, terminated, truncated, final, hidden)
+
+
+def _per_environment(name: str, x: Any, shape: tuple[int, ...]) -> Tensor:
+    """Return a tensor in a shape; ValueError, in one line, for another type or shape, and for NaN."""
+    text = f"a tensor of shape {tuple(x.shape)}" if isinstance(x, Tensor) else f"of type {type(x).__name__}"
+    try:
+        if isinstance(x, Tensor) and bool(x.isfinite().all()):
+            return x.expand(shape)
+        text += " with NaN or infinite numbers" if isinstance(x, Tensor) else ""
+    except RuntimeError:  # it does not fit
+        pass
+    raise ValueError(
+        f"{name} is {text}. Give one row for each of {shape[0]} environments: a tensor of finite numbers, {shape}."
+    )

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from idm_env.envs.policy_call import NO_NUMBERS, policy_outputs
 from idm_env.envs.transition import CompiledTransition, Tables
 from idm_env.envs.values import token_like
 from idm_env.envs.worlds import Array, address
@@ -48,7 +49,10 @@ class Driver:
         memory: tuple[int, ...] | None = None,
     ) -> None:  # fmt: skip
         recording = _Recording(policy, width, actions, dtype, memory)
-        _tried(policy, {n: torch.zeros(rows, *shape, dtype=dtype) for n, shape in recording.shapes.items()}, actions)
+        with torch.no_grad():
+            policy_outputs(
+                policy, {n: torch.zeros(rows, *s, dtype=dtype) for n, s in recording.shapes.items()}, actions
+            )
         self.names = recording.names
         inputs = recording.inputs(_MANY)
         shared = list(recording.sample)
@@ -118,41 +122,6 @@ class _Recording:
         return forwards + (digest(self.pulled, self.seeded(inputs), PolicyRows.simpler) if graph else b"")
 
 
-def _tried(policy: nn.Module, inputs: Mapping[str, Tensor], actions: int) -> None:
-    """Raise ValueError for a policy that does not take such inputs, or gives something else than actions."""
-    taken = " and ".join(f"{_NAMED[n]} of shape {_shape(x)}" for n, x in inputs.items())
-    try:
-        with torch.no_grad():
-            done = policy(*inputs.values())
-    except (RuntimeError, TypeError) as error:
-        why = str(error).splitlines()[0]
-        raise ValueError(f"policy does not take {taken}: {why}.") from None
-    rows = len(inputs["seen"])
-    if "hidden" in inputs:
-        hidden = inputs["hidden"]
-        if not (isinstance(done, tuple) and len(done) == 2 and _shape(done[1]) == _shape(hidden)):
-            raise ValueError(
-                f"policy gives {_shapes(done)}, and (actions, hidden of shape {_shape(hidden)}) are needed."
-            )
-        done = done[0]
-    if not isinstance(done, Tensor) or done.shape != (rows, actions):
-        raise ValueError(f"policy gives {_shapes(done)} for each observation, and {actions} actions are needed.")
-
-
-_NAMED = {"seen": "observations", "hidden": "hidden"}
-
-
-def _shape(x: Any) -> str:
-    """Return the shape of rows as errors tell it."""
-    return f"(n, {', '.join(str(n) for n in x.shape[1:])})" if isinstance(x, Tensor) else type(x).__name__
-
-
-def _shapes(done: Any) -> str:
-    if isinstance(done, tuple):
-        return f"({', '.join(_shape(x) for x in done)})"
-    return str(tuple(done.shape[1:])) if isinstance(done, Tensor) else type(done).__name__
-
-
 _DRIVERS: weakref.WeakKeyDictionary[nn.Module, dict[Any, Driver | None]] = weakref.WeakKeyDictionary()
 
 
@@ -187,8 +156,7 @@ def driver_of(policy: Any, seen: Tensor, actions: int, hidden: Tensor | None = N
         drivers[key] = driver
     except Untraceable:
         return None
-    except Exception:  # a policy may raise anything at inputs that it does not take; between the steps that is told
-        _tried(policy, {"seen": seen} | ({} if hidden is None else {"hidden": hidden}), actions)
+    except Exception:  # a policy may raise anything at inputs that it does not take: between the steps that is told
         return None
     return driver
 
@@ -371,8 +339,9 @@ class _Window(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
         weights = {n: x.detach().numpy() for n, x in zip(names, given, strict=False)}
         tape.run(batch, values, weights)
-        if not np.isfinite(tape.action).all():
-            raise ValueError("policy returned NaN or infinite actions. Give finite numbers in [-1, 1].")
+        for name, x in (("actions", tape.action), ("hidden numbers", tape.hidden)):
+            if not np.isfinite(x).all():
+                raise ValueError(NO_NUMBERS.format(name))
         rows, steps = tape.plan.rows, tape.steps
         parameters = [x for _, x in tape.segments[0].bound.wanted]
         ctx.tape, ctx.names, ctx.shapes = tape, names, [x.shape for x in parameters]

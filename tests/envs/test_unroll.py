@@ -4,9 +4,11 @@ import copy
 import gc
 import os
 import pickle
+import re
 import weakref
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -260,6 +262,78 @@ def test_bad_input_is_told_in_one_line_and_changes_nothing(policy, more, says):
     assert "\n" not in str(error.value)
     for _ in range(15):
         assert torch.equal(env.step(torch.zeros(5, 1))[0], other.step(torch.zeros(5, 1))[0])
+
+
+def _writing(seen):
+    seen[:, 0] = 0.5
+    return ACT(seen)
+
+
+def _writing_hidden(seen, hidden):
+    return ACT(seen), hidden.add_(1.0)
+
+
+ACT, REMEMBERED = nn.Linear(3, 1), {"hidden": torch.zeros(5, 4)}
+BETWEEN = {
+    "hidden of another width": (lambda x, h: (ACT(x), h[:, :2]), REMEMBERED, r"hidden of shape \(n, 4\)"),
+    "hidden None": (lambda x, h: (ACT(x), None), REMEMBERED, "NoneType"),
+    "hidden numpy": (lambda x, h: (ACT(x), h.numpy()), REMEMBERED, "ndarray"),
+    "hidden tuple": (lambda x, h: (ACT(x), (h, h)), REMEMBERED, "tuple"),
+    "hidden in doubles": (lambda x, h: (ACT(x), h.double()), REMEMBERED, "in torch.float32"),
+    "hidden nan": (lambda x, h: (ACT(x), h * torch.nan), REMEMBERED, "NaN or infinite hidden"),
+    "no hidden": (lambda x, h: ACT(x), REMEMBERED, "policy gives"),
+    "a list": (lambda x, h: [ACT(x), h], REMEMBERED, "policy gives list"),
+    "three": (lambda x, h: (ACT(x), h, h), REMEMBERED, "policy gives"),
+    "first hidden numpy": (lambda x, h: (ACT(x), h), {"hidden": np.zeros((5, 4))}, "hidden is of type ndarray"),
+    "first hidden tuple": (lambda x, h: (ACT(x), h), {"hidden": (torch.zeros(5, 4),)}, "hidden is of type tuple"),
+    "first hidden a number": (lambda x, h: (ACT(x), h), {"hidden": 0.0}, "hidden is of type float"),
+    "nothing": (lambda x: None, {}, "policy gives NoneType"),
+    "numpy": (lambda x: ACT(x).detach().numpy(), {}, "policy gives ndarray"),
+    "a number": (lambda x: 0.5, {}, "policy gives float"),
+    "one row": (lambda x: ACT(x)[:1], {}, "1 rows"),
+    "a tuple": (lambda x: (ACT(x), ACT(x)), {}, "policy gives"),
+    "bool": (lambda x: ACT(x) > 0.0, {}, "torch.bool"),
+    "complex": (lambda x: ACT(x) + 0j, {}, "torch.complex64"),
+    "nan": (lambda x: ACT(x) * torch.nan, {}, "NaN or infinite actions"),
+    "weights in doubles": (nn.Linear(3, 1).double(), {}, r"does not take .*float32.*Double"),
+    "doubles in a function": (lambda x: ACT.double()(x), {}, r"does not take .*float32.*Double"),
+    "no policy": (None, {}, "not callable"),
+    "writes": (_writing, {}, "writes to the observations"),
+    "writes hidden": (_writing_hidden, {"hidden": torch.zeros(5, 4)}, "writes to the observations or hidden"),
+    "push of other rows": (lambda x: ACT(x), {"push": torch.zeros(4, 1)}, r"push is .*\(4, 1\)"),
+    "push of other actions": (lambda x: ACT(x), {"push": torch.zeros(5, 3)}, r"push is .*\(5, 3\)"),
+    "push of every step": (lambda x: ACT(x), {"push": torch.zeros(5, 5, 1)}, r"push is .*\(5, 5, 1\)"),
+    "push numpy": (lambda x: ACT(x), {"push": np.zeros((5, 1))}, "push is of type ndarray"),
+    "push nan": (nn.Linear(3, 1), {"push": torch.full((5, 1), torch.nan)}, "push is .* NaN"),
+}  # fmt: skip
+
+
+def test_what_a_policy_between_steps_must_not_do_is_told_in_one_line_and_changes_nothing():
+    env = made("ring", CASES[0][1], "float32")
+    env.reset(seed=3)
+    before, wrong = env.step(torch.zeros(5, 1))[0], {}
+    for name, (policy, more, says) in BETWEEN.items():
+        try:
+            env.unroll(policy, 5, **more)
+            wrong[name] = "returned"
+        except ValueError as error:
+            if not re.search(says, str(error)) or "\n" in str(error):
+                wrong[name] = error
+        ACT.float()
+        if not torch.equal(env.batch.seen(), before):
+            wrong[name] = "it has stepped"
+    assert wrong == {}
+
+
+@pytest.mark.parametrize("policy", [ACT, lambda x: ACT(x), lambda x: ACT(x).double()])
+def test_doubles_are_the_numbers_that_they_are(policy):
+    """Loops in single precision read eight bytes as two numbers."""
+    env, other = (made("ring", CASES[0][1], "float32") for _ in range(2))
+    env.reset(seed=3), other.reset(seed=3)
+    window = env.unroll(policy, 3, push=torch.full((5, 1), 0.25, dtype=torch.float64))
+    wanted = other.unroll(ACT, 3, push=torch.full((5, 1), 0.25))
+    assert window.action.dtype == torch.float32
+    torch.testing.assert_close(window.reward, wanted.reward)
 
 
 def test_numpy_output_and_other_resets_are_refused():
