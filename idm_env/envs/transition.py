@@ -35,8 +35,10 @@ from idm_env.envs.worlds import (
 )  # fmt: skip
 from idm_env.kernels import threads as pool
 from idm_env.kernels.past_in_place import Stepper
+from idm_env.kernels.reads import Reads
 from idm_env.kernels.rows import RowFunction, adjoint, storage
-from idm_env.scalar.record import Untraceable
+from idm_env.kernels.sameness import digest
+from idm_env.scalar.record import Unordered, Untraceable
 from idm_env.tasks import EnvState
 from idm_env.types import Params, State
 
@@ -112,6 +114,15 @@ class WholeStep:
             f"then_{n}": later[n] for n in self.changing[len(self._blocks) :] if storage(later[n]) != storage(mid[n])
         }
         return out | ({"then_past": self._stepper.looked[0].now} if "past" in leaves else {})  # type: ignore[return-value]
+
+    def refuse_chance(self, graph: bool) -> None:
+        """Record the adjoint, too, of the same values; Untraceable for a step that is another one at every call.
+
+        So it is, with a ``graph``, for a tensor that requires a gradient and is no parameter (``digest``).
+        """
+        if len({digest(self._step, self.inputs, {}, gradients=graph) for _ in range(2)}) > 1:
+            raise Untraceable("a function of one's own does something else at every call")
+        _ = self.backward if graph else None
 
     def params_of(self, leaves: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
         """Return parameters as a simulator takes them."""
@@ -219,6 +230,10 @@ class CompiledTransition:
         Untraceable: For a task or a simulator that cannot be recorded.
     """
 
+    reads: Reads | None = None
+    """What functions of one's own read when the step was recorded."""
+    graph = False
+    """Whether steps may have a graph."""
     worlds: tuple[str, ...] = ("",)
     """How the names of the leaves of worlds begin from which a step is computed."""
 
@@ -244,11 +259,16 @@ class CompiledTransition:
         return ((prefix, self.layout.blocks, self.pitch),)
 
     def recorded(self, params: Params) -> WholeStep:
-        """Return the step as recorded for such parameters."""
+        """Return the step as recorded for such parameters; Unordered, if it changes its own values by being called."""
         form = tuple((e, p, _wide(x), x.requires_grad) for e, own in params.items() for p, x in own.items())
         if form not in self._recorded:
             blocks = self.layout.blocks
-            self._recorded[form] = WholeStep(self.moves, self.world, blocks, self._kind, self._draws, form)
+            step = WholeStep(self.moves, self.world, blocks, self._kind, self._draws, form)
+            if self.reads is not None and self.reads.watches:
+                step.refuse_chance(self.graph)
+                if self.reads.changed():
+                    raise Unordered("a function of one's own changes what it reads")
+            self._recorded[form] = step
         return self._recorded[form]
 
     def of(self, layout: Layout, params: Params) -> Tables:

@@ -21,9 +21,13 @@ from idm_env.envs.moves import Moves
 from idm_env.envs.past import Past
 from idm_env.envs.transition import CompiledTransition, Tables
 from idm_env.envs.worlds import WHOLE, Array, Layout, Moment, named, world_of
-from idm_env.scalar.record import Untraceable
+from idm_env.kernels.reads import Reads
+from idm_env.scalar.record import Unordered, Untraceable
 from idm_env.tasks import EnvState
 from idm_env.types import Params, mapped
+
+_WORTHWHILE = 64
+"""Steps by torch that take as long as to record a step anew."""
 
 
 class Values:
@@ -39,6 +43,8 @@ class Values:
     def __init__(self, moves: Moves, *, graph: bool) -> None:
         self._moves, self._graph = moves, graph
         self._plans: dict[tuple[bool, bool], CompiledTransition] = {}
+        self._reads: Reads | None = None
+        self._steady = _WORTHWHILE
         self._key: Any = None
         self.layout = Layout((), {}, 0)
         self.blocks: Tensor
@@ -190,13 +196,26 @@ class Values:
         """Go back to the worlds as they were: steps have written nothing that these read."""
         self.blocks, self._clock, self._token, self.layout, self.past, self.past.numbers, self.past.newest = mark
 
-    def plan(self, kind: tuple[bool, bool], draws: tuple[str, ...]) -> CompiledTransition:
-        """Return the transition of a kind, made once."""
+    def plan(self, kind: tuple[bool, bool], draws: tuple[str, ...], steps: int = 1) -> CompiledTransition:
+        """Return the transition of a kind, made once; ``steps`` is how many of them are to be done.
+
+        It is made anew where functions of one's own read something else now (``kernels.reads``). Unordered, nothing
+        changed, where that has not stayed for as many steps as are worth it.
+        """
+        if self._reads is None or self._reads.changed():
+            self._steady = _WORTHWHILE if self._reads is None else 0
+            self._plans, task = {}, self._moves.task
+            functions = *(x.feature.read for x in task.observed), *(term.of for term, _ in task.weighted.terms)
+            self._reads = Reads(functions, (task, task.road, *task.simulator.effects))
         plan = self._plans.get(kind)
         if plan is None:
+            self._steady += steps
+            if self._steady < _WORTHWHILE:
+                raise Unordered("a function of one's own reads something else now")
             world = self.glance()
             make = CompiledTransition if world.state.lanes is None else LaneTransition
             plan = make(self._moves, world, self.layout, kind, draws)
+            plan.reads, plan.graph = self._reads, self._graph
             self._plans[kind] = plan
         return plan
 

@@ -397,7 +397,7 @@ def compiled(
     driver = driver_of(policy, seen, push.shape[-1], hidden)
     if driver is None:
         return None
-    plan = values.plan((False, True), batch.task.simulator.draws)
+    plan = values.plan((False, True), batch.task.simulator.draws, steps)
     first = values.blocks
     begun = seen.new_zeros(len(seen), 0) if hidden is None else hidden
     bound = plan.of(values.layout, batch.episode_params())

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from idm_env.effects.base import Effect
+from idm_env.kernels.reads import Reads
 from idm_env.kernels.tiles import ROW, Array
 from idm_env.roads import Lane, Ring, Road
 from idm_env.roads.chains import Chains
@@ -157,16 +158,29 @@ def printed(
 
     Where an effect is why, a warning says so once, and what happens ``otherwise``.
     """
+    effects = simulator.effects
     try:
-        return _printed(make, simulator.road, simulator.effects, simulator.dt, simulator.integration, form, otherwise)
+        read = _version(effects) if simulator.own else 0
+        return _printed(make, simulator.road, effects, simulator.dt, simulator.integration, form, otherwise, read)
     except TypeError as error:  # an effect with a choice that cannot be hashed
         return f"an effect cannot be a key: {error}"
+
+
+_READS: dict[tuple[Effect, ...], tuple[Reads, int]] = {}
+
+
+def _version(effects: tuple[Effect, ...]) -> int:
+    """Return how often something that effects of one's own read beside their arguments has become another one."""
+    reads, version = _READS.get(effects, (None, -1))
+    if reads is None or reads.changed():
+        _READS[effects] = Reads((), effects), version + 1
+    return _READS[effects][1]
 
 
 @lru_cache(maxsize=512)
 def _printed(
     make: Callable[[CarFollowingStep, Form], Any], road: Road, effects: tuple[Effect, ...], dt: float,
-    integration: Integration, form: Form, otherwise: str,
+    integration: Integration, form: Form, otherwise: str, read: int,
 ) -> Any:  # fmt: skip
     try:
         return make(CarFollowingStep(road, effects, dt, integration), form)
