@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 def found(simulator: CarFollowingStep, state: State, inputs: Inputs, params: Params) -> TileKernel | str:
     """Return the kernel for this call, or why it takes the torch path."""
-    why = switched_off() or surroundings() or _unfit_tensors(state, inputs, params)
+    why = surroundings() or _unfit_tensors(state, inputs, params)
     if why is not None:
         return why
     if state.lanes is not None:
@@ -41,8 +41,8 @@ def found(simulator: CarFollowingStep, state: State, inputs: Inputs, params: Par
 
 def surroundings() -> str | None:
     """Return why no kernel can run here at all, or None."""
-    if os.environ.get("IDM_ENV_KERNELS", "1") == "0":
-        return "IDM_ENV_KERNELS=0"
+    if switched_off() is not None or os.environ.get("IDM_ENV_KERNELS", "1") == "0":
+        return switched_off() or "IDM_ENV_KERNELS=0"
     if not available():
         return "numba is not installed; pip install 'idm-env[kernels]'"
     if compat.transforming() or compat.forward_mode():

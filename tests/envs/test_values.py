@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401
+from idm_env import backends
 from idm_env.envs.batch import Batch
 from idm_env.envs.settings import settings
 from idm_env.envs.values import Values
@@ -190,6 +191,8 @@ def test_it_can_be_switched_off(monkeypatch):
         return isinstance(gym.make("DiffIDM-v0", warmup=1, **keywords).unwrapped.batch._values, Values)
 
     assert values() and values(output="torch")
+    with backends.off():
+        assert not values() and not values(output="torch")
     monkeypatch.setenv("IDM_ENV_KERNELS", "0")
     assert not values() and not values(output="torch")
 

@@ -50,6 +50,26 @@ def test_every_task_takes_every_law(name: str, how: str, drivers: Path) -> None:
         assert torch.isfinite(state.position).all() and (state.gap > 0).all() and state.speed.max() > 0.1, law
 
 
+@pytest.mark.parametrize("name", ["ring", "highway"])
+def test_every_law_is_compiled(name: str) -> None:
+    """A task of one lane and one of several: what a task says is recorded beside its drivers, whatever their law."""
+    pytest.importorskip("numba")
+    choices = {"task": name, "dtype": "float64", "vehicles": 8, "length": 120.0, "controlled": 1}
+    choices |= {"warmup": 0} if name == "ring" else {}
+    for law in BASES:
+        ours = gymnasium.make("DiffIDM-v0", **choices, effects=[law])
+        with backends.off():
+            theirs = gymnasium.make("DiffIDM-v0", **choices, effects=[law])
+        for env in (ours, theirs):
+            env.reset(seed=3)
+        for step in range(12):
+            told = [env.step(np.full(1, 0.3 * (-1) ** step, np.float32)) for env in (ours, theirs)]
+            for mine, torchs in zip(told[0][:4], told[1][:4], strict=True):
+                np.testing.assert_allclose(mine, torchs, rtol=1e-9, atol=1e-9, err_msg=law)
+        compiled = [env.unwrapped.batch._values is not None for env in (ours, theirs)]  # type: ignore[attr-defined]
+        assert compiled == [True, False], law
+
+
 @pytest.mark.parametrize("law", BASES)
 def test_lane_changes_are_judged_by_the_law_that_is_there(law: str) -> None:
     """Where only one lane is free ahead, a driver of each law wants it for what this law gains there."""
