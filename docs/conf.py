@@ -85,8 +85,8 @@ def setup(app: Any) -> None:
 
 
 def _links(app: Any, name: str, text: list[str]) -> None:
-    """Replace links into the checkout by pages of the site, and name studies, which are read in the checkout."""
+    """Replace links into the checkout by pages of the site, and name what is read in the checkout."""
     up = "../" * name.count("/")
     for file, page in PAGES.items():
         text[0] = text[0].replace(f"]({up}../{file}", f"]({up}{page}")
-    text[0] = re.sub(r"\[([^]]+)\]\((?:\.\./)+(studies/[^)]+)\)", r"\1: `\2`", text[0])
+    text[0] = re.sub(r"\[([^]]+)\]\((?:\.\./)+((?:studies/|idm_env/README)[^)]*)\)", r"\1: `\2`", text[0])
