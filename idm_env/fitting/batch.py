@@ -107,14 +107,9 @@ class Batch:
         columns = torch.as_tensor(list(index))
         steps = max(len(self.episodes[i]) for i in index)
         fine = (steps - 1) * self.substeps + 1
-        changes = {
-            name: getattr(self, name)[:length].index_select(1, columns)
-            for length, names in (
-                (steps, ("gap", "speed", "valid")),
-                (fine, ("position", "all_speed", "accel", "present")),
-            )
-            for name in names
-        }
+        fields = dict.fromkeys(("gap", "speed", "valid"), steps)
+        fields |= dict.fromkeys(("position", "all_speed", "accel", "present"), fine)
+        changes = {name: getattr(self, name)[:size].index_select(1, columns) for name, size in fields.items()}
         adjacent = [x[:fine].index_select(1, columns) for x in self.beside]
         return dataclasses.replace(
             self,

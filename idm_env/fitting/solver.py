@@ -11,9 +11,8 @@ Shapes: θ is ``[groups, p]``, φ ``[q]``, costs are ``[groups]``; units are tho
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import torch
@@ -205,14 +204,8 @@ def _apart(
         torch.where(better[..., None], fresh.gradient, data.gradient),
         torch.where(better[..., None, None], fresh.hessian, data.hessian),
     )
-    return dataclasses.replace(
-        progress,
-        own=torch.where(better[..., None], trial, own),
-        damping=damping,
-        done=done,
-        iteration=progress.iteration + 1,
-        finished=bool(done.all()),
-    ), data
+    own, count = torch.where(better[..., None], trial, own), progress.iteration + 1
+    return replace(progress, own=own, damping=damping, done=done, iteration=count, finished=bool(done.all())), data
 
 
 def _own_tried(now: Normal, progress: Progress, box: Box) -> Tensor:
@@ -255,7 +248,7 @@ def _together(
         data = problem.normal(own, shared)
     # Own parameters that gain little alone say nothing of a step of the shared ones that was refused.
     decisive = (gain > 0.0 and best < len(SIZES)) or 0.0 <= promised <= tolerance * total or shared_damping > 1e6
-    return dataclasses.replace(
+    return replace(
         progress,
         own=own,
         shared=shared,

@@ -7,6 +7,10 @@ limits the vehicle: it is the driver who decides. He judges by what he sees now,
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -50,19 +54,8 @@ def wished(stepping: CarFollowingStep, scene: Scene, params: Params) -> Wish:
         wish = effect.change(scene, driver, dict(params[effect.name]))
         wish = wish._replace(left_most=wish.left, right_most=wish.right)
         if total is not None:
-            assert total.left_most is not None and total.right_most is not None
-            wish = Wish(
-                total.left + wish.left,
-                total.right + wish.right,
-                torch.minimum(total.left_margin, wish.left_margin),
-                torch.minimum(total.right_margin, wish.right_margin),
-                torch.maximum(total.left_most, wish.left),
-                torch.maximum(total.right_most, wish.right),
-                _larger(total.left_despite, wish.left_despite),
-                _larger(total.right_despite, wish.right_despite),
-                _larger(total.left_must, wish.left_must),
-                _larger(total.right_must, wish.right_must),
-            )
+            pairs = zip(total, wish, strict=True)
+            wish = Wish(*(_JOINS[k // 2](a, b) for k, (a, b) in enumerate(pairs)))
         total = wish
     assert total is not None
     left, right = _larger(total.left_margin, total.left_despite), _larger(total.right_margin, total.right_despite)
@@ -84,6 +77,10 @@ def wished(stepping: CarFollowingStep, scene: Scene, params: Params) -> Wish:
 def _larger(a: Tensor | None, b: Tensor | None) -> Tensor | None:
     """Return the larger of two margins, of which either may not be said."""
     return b if a is None else a if b is None else torch.maximum(a, b)
+
+
+_JOINS: tuple[Callable[[Any, Any], Any], ...] = (operator.add, torch.minimum, torch.maximum, _larger, _larger)
+"""How two wishes are one: utilities, margins, largest utilities, margins despite, musts; to the left and right each."""
 
 
 def lane_scene(
@@ -149,22 +146,9 @@ def _one_side(
     if stepping.rooms:
         exists = torch.where(ends > 0, exists, 0.0)
     me = Neighbour(side.back_gap, scene.speed, scene.accel, torch.ones_like(scene.speed))
-    mine = Neighbour(
-        torch.where(nearest.present > 0, side.back_gap + state.length + nearest.gap, FAR),
-        nearest.speed,
-        nearest.accel,
-        nearest.present,
-    )
+    mine = nearest._replace(gap=torch.where(nearest.present > 0, side.back_gap + state.length + nearest.gap, FAR))
     follower = mapped(his, scene)._replace(leader=me, second_leader=scene.second_leader and mine)
     if scene.lane is not None:  # he is on it already
         follower = follower._replace(lane=his(state.memory[LANE]))
     with_me = stepping.wanted(follower, mapped(his, dict(params)))[0]
-    return Beside(
-        exists=exists,
-        leader=nearest,
-        follower=behind,
-        wanted=accel,
-        with_me=with_me * behind.present,
-        without_me=his(now) * behind.present,
-        ends=ends,
-    )
+    return Beside(exists, nearest, behind, accel, with_me * behind.present, his(now) * behind.present, ends)

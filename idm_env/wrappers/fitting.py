@@ -69,17 +69,10 @@ class ParameterFitting:
         self.by = by
         group, groups = group_of(self.episodes, by)
         self.fixed = _fixed(simulator, params, self.free)
-        self.problem = Problem(
-            simulator,
-            # One step of the simulation per step of the environment: what is fitted is what will be driven.
-            Batch.stack(self.episodes, substeps=1),
-            self.free,
-            (),
-            group,
-            groups,
-            objective=objective,  # type: ignore[arg-type]
-            fixed=self.fixed,
-        )
+        # One step of the simulation per step of the environment: what is fitted is what will be driven.
+        batch = Batch.stack(self.episodes, substeps=1)
+        kind: Any = objective
+        self.problem = Problem(simulator, batch, self.free, (), group, groups, objective=kind, fixed=self.fixed)
         self._declared = {name: catalogue(simulator.effects)[name] for name in self.free}
         self._leaves = {name: torch.zeros(len(groups), dtype=torch.float64, requires_grad=True) for name in self.free}
         self.set_values({name: _value(params, name, self._declared[name].default) for name in self.free})
@@ -141,16 +134,9 @@ class ParameterFitting:
         chosen: dict[str, Any] = {"loss": "mse", **options}
         if chosen.get("starts") == 1:
             chosen["start"] = (own, own.new_zeros(0))
-        result = fit(
-            self.episodes,
-            by=self.by,
-            simulator=self.problem.simulator,
-            free=self.free,
-            objective=self.problem.objective,
-            substeps=1,
-            fixed=self.fixed,
-            **chosen,
-        )
+        mine: dict[str, Any] = {"by": self.by, "free": self.free, "fixed": self.fixed, "substeps": 1}
+        mine |= {"simulator": self.problem.simulator, "objective": self.problem.objective}
+        result = fit(self.episodes, **mine, **chosen)
         self.set_values({name: result.own[:, i] for i, name in enumerate(self.free)})
         return result
 
