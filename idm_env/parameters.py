@@ -21,7 +21,7 @@ from torch.distributions import biject_to, constraints
 from torch.distributions.transforms import Transform
 
 from idm_env.types import Params
-from idm_env.validation import nearest as nearest, one_of as one_of, shown
+from idm_env.validation import at_least as at_least, nearest as nearest, one_of as one_of, shown, whole as whole
 
 Role = Literal["strength", "shape", "threshold", "place"]
 V = TypeVar("V")

@@ -59,6 +59,11 @@ class CarFollowingStep:
         double = {n for n in names if names.count(n) > 1}
         if double:
             raise ValueError(f"effect '{double.pop()}' is given twice. Every effect of a simulator needs its own name.")
+        for e in self.effects:
+            who = f"effect '{e.name}': {type(e).__name__}"
+            parameters.at_least(f"{who}.looks_back", e.looks_back, 0.0, "s", 3600.0)
+            parameters.at_least(f"{who}.decides_every", e.decides_every, 0.0, "s", 3600.0)
+            parameters.whole(f"{who}.decides_in_blocks", e.decides_in_blocks, 0, 10**9)
         following = [e.name for e in self.effects if isinstance(e, CarFollowing)]
         if len(following) != 1:
             raise ValueError(

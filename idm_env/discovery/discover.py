@@ -33,6 +33,7 @@ from idm_env.effects import (
     named,
     register,
 )
+from idm_env.fitting.fit import refuse_nan
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.validation import nearest
@@ -84,6 +85,7 @@ def discover(
     if not names:
         why = "; ".join(f"{name}: {reason}" for name, reason in refused.items()) or "all of them are known"
         raise ValueError(f"no candidate can be tried on these data ({why}). Name others, or leave out --effects.")
+    refuse_nan(prepared.episodes, law, tried)
     fit_runs, test_runs = _split(prepared, lockbox, seed)
     rows = records.windows(prepared.of_runs(fit_runs))
     known_terms = tuple(_known_term(prepared, name) for name in known)

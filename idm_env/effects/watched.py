@@ -17,9 +17,10 @@ from idm_env.types import Driver, Motion, Scene, Wish
 
 RETURNS: Mapping[str, type] = {
     "perceive": Scene, "adapt": Driver, "driver": Driver, "accelerate": Tensor, "limit": Tensor, "place": Motion,
-    "change": Wish, "remember": Tensor,
+    "change": Wish, "remember": Tensor, "initial_memory": Tensor, "room": Tensor,
 }  # fmt: skip
 """What the methods of an effect return that a step calls; a plain number stands for a tensor, too."""
+MAY_BE_NONE = ("initial_memory", "room")
 
 
 def watched(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
@@ -34,7 +35,7 @@ def watched(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
     def call(self: Any, *args: Any, **named: Any) -> Any:
         if named or torch.compiler.is_compiling() or compat.transforming():
             return method(self, *args, **named)
-        who = f"effect '{self.name}': {name}"
+        who = f"effect '{self.name}': {type(self).__name__}.{name}"
         seen = [_Limited.of(x, self.looks_back, who) if isinstance(x, Scene) else x for x in args]
         leaves = dict(leaf for x in args for leaf in _leaves(x))
         recorded = any(hasattr(x, "suspected") for x in leaves.values())
@@ -56,7 +57,8 @@ def watched(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         changed = next((k for k, version in before.items() if leaves[k]._version != version), None)
         if changed is not None:
             raise ValueError(f"{who} changes {changed} in place, which others read, too. Return a new tensor.")
-        _check(who, RETURNS[name], result, results, leaves)
+        if result is not None or name not in MAY_BE_NONE:
+            _check(who, RETURNS[name], result, results, leaves)
         return result
 
     return call
@@ -97,7 +99,10 @@ def _check(who: str, kind: type, result: Any, results: Mapping[str, Any], leaves
         index = bad.expand(torch.broadcast_shapes(bad.shape, room)).nonzero()[0]
         vehicle, time = (f" for vehicle {int(index[-1])}" if len(index) else ""), leaves.get("scene.time")
         when = "" if time is None else f" at {float(time.reshape(-1)[0]):.4g} s"
-        raise ValueError(f"{who} returned {part + ' ' if part else ''}nan{vehicle}{when}. It must return numbers.")
+        raise ValueError(
+            f"{who} returned {part + ' ' if part else ''}nan{vehicle}{when}. Keep what it divides by, and takes roots "
+            "or logarithms of, above 0."
+        )
 
 
 def _judged(side: str, leaves: Mapping[str, Tensor]) -> Tensor:

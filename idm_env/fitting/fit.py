@@ -13,7 +13,7 @@ from scipy.stats import qmc
 from torch import Tensor
 
 from idm_env.data import Episode
-from idm_env.effects import IDM, Brakes, CarFollowing, Replay
+from idm_env.effects import IDM, Brakes, CarFollowing, Effect, Replay
 from idm_env.fitting.adam import adam
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.prior import Prior
@@ -63,6 +63,16 @@ class Fit:
 def base_simulator(dt: float = 0.1, base: CarFollowing | None = None, **choices: Any) -> Simulator:
     """Return the simulator to calibrate: a car-following law (IDM) and brakes in a lane behind replayed neighbours."""
     return Simulator(Lane(), (base or IDM(), Replay(), Brakes()), dt=dt, **choices)
+
+
+def refuse_nan(items: Sequence[Episode], law: CarFollowing, effects: Sequence[Effect]) -> None:
+    """Simulate each of the user's own, with its defaults, behind measured leaders; ValueError names a hook's NaN."""
+    batch = Batch.stack(items)
+    for effect in (law, *effects):
+        if effect.own:
+            simulator = base_simulator(batch.step, law).adding(*() if effect is law else (effect,))
+            group = torch.zeros(len(batch), dtype=torch.int64)
+            Problem(simulator, batch, (), (), group, ("all",)).simulate({})
 
 
 def own_names(simulator: Simulator) -> tuple[str, ...]:
@@ -165,6 +175,7 @@ def _adam(
             on_progress("adam", step, steps, value**0.5)
 
     own, shared, _ = adam(problem, own, shared, steps=steps, state=saved.get("adam"), on_step=on_step)
+    problem.simulate(problem.rows(own, shared))  # NaN has no inverse, and is told by whose it is
     # Adam has no test of its own: a Gauss–Newton step that would gain more than 1 % says that it has not arrived.
     now = normal(problem, own[None], shared[None])
     gain = torch.einsum("gp,gpq,gq->g", now.gradient[0], torch.linalg.pinv(now.hessian[0]), now.gradient[0])
@@ -183,7 +194,7 @@ def _levenberg(
     if starts > 1 and not problem.shared:
         several = _spread(problem, own, starts, seed)
         first = _phase("starts", problem, several, shared.expand(starts, -1), min(10, iterations), saved, on_progress)
-        best = first[1].cost.argmin(0)
+        best = first[1].cost.nan_to_num(torch.inf).argmin(0)
         own = first[0].own[best, torch.arange(len(best))]
     progress, _ = _phase("final", problem, own[None], shared[None], iterations, saved, on_progress)
     converged = progress.done[0] if not problem.shared else torch.full((len(problem.groups),), progress.finished)
@@ -213,4 +224,7 @@ def _phase(
             mean = cost / len(problem.batch) if problem.loss == "rmse" else (cost / problem.samples.sum()).sqrt()
             on_progress(name, now.iteration, iterations, float(mean))
 
-    return minimise(problem, progress, iterations, on_step=on_step)
+    progress, equations = minimise(problem, progress, iterations, on_step=on_step)
+    if bool(equations.cost.isnan().all(0).any()):
+        problem.simulate(problem.rows(progress.own, progress.shared))  # tells whose it is
+    return progress, equations

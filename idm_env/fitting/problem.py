@@ -133,13 +133,18 @@ class Problem:
         return replaced(params, {**fixed, **values})
 
     def simulate(self, values: dict[str, Tensor]) -> Simulated:
-        """Roll the drivers out behind their measured leaders; ``values`` are [..., rows] by parameter name."""
+        """Roll the drivers out behind their measured leaders; ``values`` are [..., rows] by parameter name.
+
+        ValueError names an effect of one's own that returns NaN.
+        """
         if self._compiled is None:
             return self._rollout(values)
         params = self.params({name: value.unsqueeze(-1) for name, value in values.items()})
-        return Simulated(
-            *self._compiled.simulate(self.batch.start(self.simulator, params), params, self.batch.substeps)
-        )
+        state = self.batch.start(self.simulator, params)
+        simulated = Simulated(*self._compiled.simulate(state, params, self.batch.substeps))
+        # NaN that an effect of one's own has made is told by the step itself.
+        is_nan = self.simulator.own and bool(simulated.gap.isnan().any())
+        return self._rollout(values) if is_nan else simulated
 
     def _rollout(self, values: dict[str, Tensor]) -> Simulated:
         _, driver = self.batch.columns(self.simulator)
