@@ -90,7 +90,7 @@ def run(
     finally:
         torch.set_num_threads(threads)
     tell("gpu" if torch.cuda.is_available() else "the report")
-    result["gpu"] = gpu.rows(sizes, rounds) if torch.cuda.is_available() else None
+    result["gpu"] = dict(gpu.rows(sizes, rounds)) if torch.cuda.is_available() else None
     if out is not None:
         from benchmarks.bench.picture import draw
 

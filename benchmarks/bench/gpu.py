@@ -6,9 +6,8 @@ events, the least of the rounds.
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium
@@ -24,21 +23,19 @@ FACES: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
 }
 
 
-def rows(sizes: Sequence[int], rounds: int) -> dict[str, Any]:
-    """Return milliseconds per step by case: ``rollout`` of so many vehicles, ``step`` of so many environments."""
-    times: dict[str, Any] = {"device": torch.cuda.get_device_name(), "torch": torch.__version__}
+def rows(sizes: Sequence[int], rounds: int) -> Iterator[tuple[str, float]]:
+    """Yield cases and their milliseconds per step: a ``rollout`` of N vehicles, a ``step`` of N environments."""
     for vehicles in sizes:
         lanes = traffic.Traffic(vehicles, "cuda")
         for backward in (False, True):
             torch.compiler.reset()  # type: ignore[no-untyped-call]
             case = lanes.ours(lanes.simulator.compile(), False, backward)
-            times[f"rollout {vehicles} {_kind(backward)}"] = _least(case.run, rounds) / case.units
+            yield f"rollout {vehicles} {_kind(backward)}", _least(case.run, rounds) / case.units
     for task, (keywords, counts) in FACES.items():
         for count in counts:
             for backward in (False, True):
                 loop = _loop(task, count, backward, **keywords)
-                times[f"step {task} {count} {_kind(backward)}"] = _least(loop, rounds) / STEPS
-    return times
+                yield f"step {task} {count} {_kind(backward)}", _least(loop, rounds) / STEPS
 
 
 def _kind(backward: bool) -> str:
@@ -82,4 +79,6 @@ def _least(run: Callable[[], object], rounds: int) -> float:
 if __name__ == "__main__":
     if not torch.cuda.is_available():
         sys.exit("There is no GPU here: run this where torch.cuda.is_available() says True.")
-    json.dump(rows((2_000, 20_000, 200_000, 2_000_000), 5), sys.stdout, indent=2)
+    print(torch.cuda.get_device_name(), torch.__version__)
+    for case, milliseconds in rows((2_000, 20_000, 200_000, 2_000_000), 3):
+        print(f"{case:40} {milliseconds:9.4f} ms", flush=True)
