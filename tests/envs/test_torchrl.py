@@ -105,7 +105,7 @@ def test_the_vector_says_its_mode_as_gymnasiums_vectors_do():
 
 @pytest.mark.parametrize("use_mask", [False, True])
 def test_fixed_agents_of_an_open_road_are_collected_with_their_mask(use_mask):
-    road = {"vehicles": 30, "controlled": [2, 9], "inflow": 2400.0, "ramp_inflow": 500.0, "max_episode_steps": 6}
+    road = {"vehicles": 30, "controlled": [2, 29], "inflow": 2400.0, "ramp_inflow": 500.0, "max_episode_steps": 6}
     with backends.off():
         env = PettingZooWrapper(parallel_env(task="merge", fixed=True, **road), use_mask=use_mask)
         check_env_specs(env)
