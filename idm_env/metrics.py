@@ -27,6 +27,47 @@ def time_gap(gap: Tensor, speed: Tensor, slowest: float = 1.0) -> Tensor:
     return gap / speed.clamp_min(slowest)
 
 
+def time_to_collision(gap: Tensor, closing: Tensor) -> Tensor:
+    """Return ``gap / closing`` (s) where the closing speed ``v − v_lead`` (m/s) is above 0, elsewhere infinity.
+
+    The time until two vehicles touch if neither changes its speed, 0 for those that do; gap in metres, elementwise.
+    J. C. Hayward 1972, "Near-miss determination through use of a scale of danger", Highway Research Record 384, 24.
+    """
+    near = closing > 0.0
+    return torch.where(near, gap.clamp_min(0.0) / torch.where(near, closing, 1.0), torch.inf)
+
+
+def drac(gap: Tensor, closing: Tensor) -> Tensor:
+    """Return the deceleration rate to avoid a crash (m/s²): ``closing² / (2 gap)`` where closing, elsewhere 0.
+
+    By which a follower stops closing just before he touches; gaps (m) count as at least 1 cm, elementwise.
+    D. F. Cooper, N. Ferguson 1976, "Traffic studies at T-junctions", Traffic Engineering and Control 17(7), 306.
+    """
+    return torch.relu(closing).square() / (2.0 * gap.clamp_min(0.01))
+
+
+def post_encroachment_time(front: Tensor, length: Tensor, area: tuple[float, float], dt: float) -> Tensor:
+    """Return the time (s) from when one vehicle has left a conflict area until the other enters it; shape ``(…)``.
+
+    Where two ways cross or merge: ``front`` ``(time, …, 2)`` is each vehicle's place along its own way (m), ``area``
+    where the stretch that both ways share begins and ends on it (m), ``length`` ``(…, 2)`` in metres; rows are ``dt``
+    (s) apart, between which places are linear. Below 0 both were there at once; NaN where either does not pass.
+    B. L. Allen, B. T. Shin, P. J. Cooper 1978, "Analysis of traffic conflicts and collisions", Transportation Research
+    Record 667, 67.
+    """
+
+    def passed(place: Tensor, mark: float) -> Tensor:
+        crossing = (place[:-1] < mark) & (place[1:] >= mark)
+        row = crossing.to(torch.int8).argmax(0, keepdim=True)
+        before, after = place.gather(0, row)[0], place.gather(0, row + 1)[0]
+        return torch.where(crossing.any(0), dt * (row[0] + (mark - before) / (after - before)), torch.nan)
+
+    enters, leaves = passed(front, area[0]), passed(front - length, area[1])
+    first = enters[..., 0] <= enters[..., 1]
+    gap = torch.where(first, enters[..., 1] - leaves[..., 0], enters[..., 0] - leaves[..., 1])
+    return torch.where(enters.isnan().any(-1), torch.nan, gap)
+
+
 def fuel(speed: Tensor, accel: Tensor, model: str = "kamal") -> Tensor:
     """Return the fuel rate of a passenger car (mL/s) by one of ``FUELS``: ``"kamal"`` or ``"circles"``.
 

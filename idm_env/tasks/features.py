@@ -148,6 +148,16 @@ def closing_speed(view: AgentView) -> Tensor:
     return speed(view) - lead_speed(view)
 
 
+def time_to_collision(view: AgentView) -> Tensor:
+    """Return the time to collision (s) with the leader: ``s/(v − v_lead)`` where closing."""
+    return metrics.time_to_collision(gap(view), closing_speed(view))
+
+
+def drac(view: AgentView) -> Tensor:
+    """Return the deceleration (m/s²) that avoids a crash: ``(v − v_lead)²/(2 s)`` where closing."""
+    return metrics.drac(gap(view), closing_speed(view))
+
+
 def leader_accel(view: AgentView) -> Tensor:
     """Return A_lead (m/s²), 0 without a leader."""
     return view.leader(view.state.accel, nobody=0.0)
@@ -176,6 +186,8 @@ FEATURES: dict[str, Feature] = {
         Feature("lead_speed", "v_lead", "m/s", 20.0, 0.0, 100.0, lead_speed),
         Feature("relative_speed", "v_lead − v", "m/s", 10.0, -100.0, 100.0, relative_speed),
         Feature("closing_speed", "v − v_lead", "m/s", 10.0, -100.0, 100.0, closing_speed),
+        Feature("time_to_collision", "TTC", "s", 10.0, 0.0, 100.0, time_to_collision),
+        Feature("drac", "DRAC", "m/s²", 2.0, 0.0, 20.0, drac),
         Feature("leader_accel", "A_lead", "m/s²", 2.0, -20.0, 20.0, leader_accel),
         Feature("mean_speed", "⟨v⟩", "m/s", 20.0, 0.0, 100.0, mean_speed),
         Feature("lane", "lane", "", 1.0, 0.0, 100.0, lane),

@@ -139,6 +139,19 @@ def tailgating(step: Transition) -> Tensor:
     return torch.relu(1.0 - features.time_gap(step.view))
 
 
+def conflict(step: Transition) -> Tensor:
+    """Return ``max(0, 1 − TTC/4 s)``, TTC that of ``metrics.time_to_collision``.
+
+    4 s is the usual threshold of a conflict: M. M. Minderhoud, P. H. L. Bovy 2001, Accid. Anal. Prev. 33(1), 89.
+    """
+    return torch.relu(1.0 - features.time_to_collision(step.view) / 4.0)
+
+
+def drac(step: Transition) -> Tensor:
+    """Return the deceleration (m/s²) that avoids a crash (``metrics.drac``)."""
+    return features.drac(step.view)
+
+
 REWARD_TERMS: dict[str, RewardTerm] = {
     each.name: each
     for each in (
@@ -152,6 +165,8 @@ REWARD_TERMS: dict[str, RewardTerm] = {
         RewardTerm("fuel", "⟨F⟩", "mL/s", 0.0, 10.0, fuel),
         RewardTerm("co2", "⟨CO₂⟩", "g/s", 0.0, 25.0, co2),
         RewardTerm("lag", "v_lead − v", "m/s", -20.0, 20.0, lag),
+        RewardTerm("conflict", "max(0, 1 − TTC/4 s)", "", 0.0, 1.0, conflict),
+        RewardTerm("drac", "DRAC", "m/s²", 0.0, 10.0, drac),
         RewardTerm("tailgating", "max(0, 1 − T/1 s)", "", 0.0, 1.0, tailgating),
     )
 }

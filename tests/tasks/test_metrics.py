@@ -78,3 +78,24 @@ def test_equilibrium_speed_does_not_accelerate():
 
 def test_time_gaps_are_finite_at_standstill():
     assert float(metrics.time_gap(torch.tensor(3.0), torch.tensor(0.0))) == 3.0
+
+
+def test_conflicts_are_those_known_by_hand():
+    gap, closing = torch.tensor([20.0, 20.0, 0.5, -1.0]), torch.tensor([5.0, -5.0, 0.0, 2.0], requires_grad=True)
+    time, decel = metrics.time_to_collision(gap, closing), metrics.drac(gap, closing)
+    assert time.tolist() == [4.0, torch.inf, torch.inf, 0.0]
+    assert decel.tolist() == [0.625, 0.0, 0.0, pytest.approx(200.0)]
+    (slope,) = torch.autograd.grad(decel.sum() + time[0], closing)
+    assert slope.tolist() == pytest.approx([0.25 - 0.8, 0.0, 0.0, 200.0])
+
+
+def test_post_encroachment_is_from_the_rear_of_the_first_to_the_front_of_the_second():
+    """At 10 and 20 m/s through 100 … 110 m: the first, 5 m long, is out after 11.5 s, the second 13 s after in."""
+    t, area = 0.4 * torch.arange(80, dtype=torch.float64), (100.0, 110.0)
+    first, second, never = 10.0 * t, 20.0 * t - 160.0, 3.0 * t - 50.0
+    pairs = torch.stack([torch.stack(x, -1) for x in ((first, second), (second, first), (first, never))], 1)
+    length = torch.tensor([5.0, 5.0], dtype=torch.float64)
+    times = metrics.post_encroachment_time(pairs, length, area, 0.4)
+    assert times[:2].tolist() == pytest.approx([13.0 - 11.5] * 2) and bool(times[2].isnan())
+    together = torch.stack((first, first - 4.0), -1)
+    assert float(metrics.post_encroachment_time(together, length, area, 0.4)) == pytest.approx(10.4 - 11.5)
