@@ -118,11 +118,6 @@ FUELS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"kamal": kamal_fuel, "ci
 """Published models of fuel; they differ, so figures of fuel name theirs."""
 
 
-def fuel_per_100_km(speed: Tensor, accel: Tensor, model: str = "kamal") -> Tensor:
-    """Return litres per 100 km of one vehicle over time (first dimension): ``100 Σ fuel / Σ v``."""
-    return 100.0 * fuel(speed, accel, model).sum(0) / speed.sum(0).clamp_min(1e-6)
-
-
 def traction_energy(speed: Tensor, accel: Tensor, dt: float, *, rolling: float = 0.015, drag: float = 4e-4) -> Tensor:
     """Return the specific energy at the wheels over time (J/kg): ``Σ max(v (a + g c_r + c v²), 0) Δt``, time first.
 
@@ -139,8 +134,3 @@ def amplification(speed: Tensor, head: int = 0) -> Tensor:
     """
     spread = speed.std(0, correction=0)
     return spread / spread[..., head : head + 1].clamp_min(1e-6)
-
-
-def string_stable(speed: Tensor, head: int = 0) -> Tensor:
-    """Return whether the last vehicle disturbs its speed no more than ``head`` does; bool, shape ``(…)``."""
-    return amplification(speed, head)[..., -1] <= 1.0

@@ -89,8 +89,7 @@ class OpenHighwayTask(OpenLanesTask):
     def closed(self) -> Sequence[Mapping[str, Any]]:
         """As they are given; between the ramps there is no lane 0."""
         on, off = self._ramps
-        between = ({"lane": 0, "begin": on[1], "end": off[0]},) if on and off else ()
-        return (*self.closures, *between)
+        return (*self.closures, {"lane": 0, "begin": on[1], "end": off[0]}) if on and off else self.closures
 
     @property
     def exits(self) -> Mapping[str, float]:
@@ -132,42 +131,24 @@ class OpenHighwayTask(OpenLanesTask):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MergeTask(OpenLanesTask):
+class MergeTask(OpenHighwayTask):
     """A demonstration: two lanes, and a ramp on their right from which one must merge within 200 m; it begins at 100 m.
 
-    Args:
-        inflow: Vehicles an hour on the two lanes together.
-        ramp_inflow: Vehicles an hour on the ramp.
+    It is ``open_highway`` with other defaults, and takes its keywords.
     """
 
     name: ClassVar[str] = "merge"
-    ranges: ClassVar[Mapping[str, Range]] = {"ramp_inflow": FLOW}
 
-    can_draw: ClassVar[tuple[str, ...]] = ("inflow", "ramp_inflow")
-    begins_with: ClassVar[tuple[str, ...]] = ("inflow", "ramp_inflow")
-
+    lanes_count: int = 2
+    length: float = 900.0
     inflow: float = 3000.0
+    on_ramp: Sequence[float] | None = (400.0, 600.0)
     ramp_inflow: float = 800.0
-
-    @cached_property
-    def road(self) -> Lanes:  # type: ignore[override]
-        """Two lanes of 900 m, and the ramp, which is lane 0."""
-        return Lanes(3, length=900.0, ends=(on_ramp(0, begin=400.0, end=600.0, entry=100.0),))
-
-    @property
-    def ramp(self) -> int | None:
-        """The ramp's lane."""
-        return 0
-
-    @property
-    def inflows(self) -> Mapping[int, float]:
-        """The ramp's, and half of the other for each lane."""
-        return {0: self.ramp_inflow, 1: 0.5 * self.inflow, 2: 0.5 * self.inflow}
 
     @property
     def filled(self) -> float:
         """Up to where vehicles are when an episode begins (m)."""
-        return 350.0
+        return min(350.0, 0.5 * self.length)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

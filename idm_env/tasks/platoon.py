@@ -96,14 +96,8 @@ class PlatoonTask(BehindHeadTask):
         low, high = span("period", self.period, 1.0, "s")
         u = draw.uniforms(_WAVE_STREAM, 3 * _WAVES, like.dtype).view(-1, 3, _WAVES)
         share = u[:, 2] + 0.2
-        waves = torch.stack(
-            (
-                2.0 * math.pi / (low + (high - low) * u[:, 0]),
-                2.0 * math.pi * u[:, 1],
-                self.disturbance * share / share.sum(-1, keepdim=True),
-            ),
-            dim=1,
-        )
+        frequency, amplitude = 2.0 * math.pi / (low + (high - low) * u[:, 0]), share / share.sum(-1, keepdim=True)
+        waves = torch.stack((frequency, 2.0 * math.pi * u[:, 1], self.disturbance * amplitude), dim=1)
         return self._in_equilibrium({"waves": waves}, params)
 
     def _motion(self, episode: Mapping[str, Tensor], step: Tensor, dtype: torch.dtype) -> Tensor:

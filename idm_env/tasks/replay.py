@@ -221,16 +221,9 @@ class ReplayTask(Task):
         start = starts[(draw.uniforms(_START_STREAM, 1, torch.float64).squeeze(-1) * len(starts)).long()]
         motion, present = self._recorded(start, like.dtype)
         length = self.constant("length", self.scene.length, start.device, like.dtype)
-        state = self.simulator.state(
-            motion[..., 0],
-            motion[..., 1],
-            params,
-            accel=motion[..., 2],
-            length=length,
-            present=present,
-            step=torch.zeros_like(start),
-            lane=self.lane_at(start),
-        )
+        position, speed, accel = motion.unbind(-1)
+        more: dict[str, Any] = {"length": length, "present": present, "lane": self.lane_at(start)}
+        state = self.simulator.state(position, speed, params, accel=accel, step=torch.zeros_like(start), **more)
         return EnvState(state, {"start": start})
 
     def lane_at(self, time: Tensor) -> Tensor | None:

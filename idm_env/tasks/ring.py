@@ -7,18 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Ring, Road
 from idm_env.tasks.base import EnvState, Task
-from idm_env.tasks.checks import Range, only_with, span
-from idm_env.tasks.crash import floored
-from idm_env.tasks.features import Feature, feature, time_gap
+from idm_env.tasks.checks import Range, span
+from idm_env.tasks.features import Feature, feature
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition
 from idm_env.types import Command, Inputs, Params, State
@@ -31,8 +29,6 @@ _LENGTH_STREAM, _SHOCK_STREAM = 1, 2
 _MOST_SHOCKS = 32
 _FASTEST = 40.0
 """Speed (m/s) up to which a vehicle's own is observed and the mean is paid."""
-_FUEL = 5.0
-"""Fuel rate (mL/s) from which its term saturates: hard acceleration at motorway speed."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,17 +45,13 @@ class RingTask(Task):
     Speeds are clipped to 40 m/s, their difference to ±20 m/s, headways to −10 m … the longest ring.
     Reward, the same for all agents: ``0.9 ⟨min(v/v*, 1)⟩ + 0.1 (1 − (u/u_max)²)``, over all vehicles after the step,
     ``v* = (mean gap − 2 m)/1 s`` the speed at which these drivers keep equal gaps. ``reward="flow"``: ``4 mean(v)/20 −
-    4 |u|`` (v at most 40 m/s, u in m/s²), less ``tailgating · max(0, 1 − time gap / tailgating_below)`` and ``fuel ·
-    mean fuel rate (mL/s)``, which saturates from 5 to 10 mL/s. Terminated where vehicles touch.
+    4 |u|`` (v at most 40 m/s, u in m/s²). Further terms: ``reward={"speed": 0.2, "effort": -4.0, "tailgating": -2.0}``.
+    Terminated where vehicles touch.
 
     Args:
         length: Circumference (m), or ``[lowest, highest]`` to be drawn for every episode.
         start: ``"uniform"``: equal gaps, standing. ``"wave"``: gaps and speeds in a wave, for a developed one with less
             warm-up.
-        tailgating: Weight of the tailgating term of ``reward="flow"``; 0 leaves it out.
-        tailgating_below: Time gap below which it counts (s). An agent holds about that gap: leave a margin.
-        fuel: Weight of the fuel term of ``reward="flow"`` (s/mL); 0 leaves it out.
-        fuel_model: Whose fuel: ``"kamal"`` or ``"circles"`` (``idm_env.metrics.FUELS``).
         shock: Deceleration (m/s²) with which a human driver brakes now and then, whatever is ahead: as hard as the
             brakes allow, by a command in place of the driver's acceleration; 0 is no shock.
         shock_every: Once in every so many seconds of an episode, at a drawn time, a drawn human driver brakes.
@@ -79,9 +71,6 @@ class RingTask(Task):
     begins_with: ClassVar[tuple[str, ...]] = ("length", "start")
     ranges: ClassVar[Mapping[str, Range]] = {
         "length": Range(1.0, 1e6, "m", ends=True),
-        "tailgating": Range(0.0, 1e6),
-        "tailgating_below": Range(0.1, 60.0, "s"),
-        "fuel": Range(0.0, 1e6),
         "shock": Range(0.0, 100.0, "m/s²"),
         "shock_every": Range(1.0, 1e6, "s"),
         "shock_after": Range(0.0, 1e6, "s", several=True),
@@ -93,10 +82,6 @@ class RingTask(Task):
     noise: float = 0.2
     warmup: int = 1500
     start: str = "uniform"
-    tailgating: float = 0.0
-    tailgating_below: float = 0.8
-    fuel: float = 0.0
-    fuel_model: str = "kamal"
     shock: float = 4.0
     shock_every: float = 60.0
     shock_after: float | Sequence[float] | None = None
@@ -112,7 +97,6 @@ class RingTask(Task):
                 f"{shortest:g} m. Take fewer vehicles or a longer ring."
             )
         one_of("start", self.start, STARTS)
-        one_of("fuel_model", self.fuel_model, metrics.FUELS)
         at_least("shock_seconds", self.shock_seconds, self.simulator.dt, "s")
         at_least("shock_every", self.shock_every, self.shock_seconds, "s")
         explicit = self.shock_after is not None
@@ -123,7 +107,6 @@ class RingTask(Task):
             )
         if (self.shock and explicit) or self.shock_vehicle is not None:
             self._check_shocked()
-        only_with(self, "flow", ("tailgating", "fuel"))
 
     def _check_shocked(self) -> None:
         """Check that a human driver brakes."""
@@ -186,21 +169,7 @@ class RingTask(Task):
         """``unit``, and Flow's."""
         low, high = self.command_limits
         flow = {REWARD_TERMS["speed"]: 0.2, replace(REWARD_TERMS["effort"], high=max(-low, high)): -4.0}
-        if self.tailgating:
-            flow[RewardTerm("tailgating", "max(0, 1 − T/T_min)", "", 0.0, 1.0, self._tailgates)] = -self.tailgating
-        if self.fuel:
-            flow[RewardTerm("fuel", "⟨F⟩", "mL/s", 0.0, 10.0, self._fuel)] = -self.fuel
         return {"unit": {EVEN: 0.9, REWARD_TERMS["ease"]: 0.1}, "flow": flow}
-
-    def _tailgates(self, step: Transition) -> Tensor:
-        """Return ``max(0, 1 − time gap / tailgating_below)``."""
-        return torch.relu(1.0 - time_gap(step.view) / self.tailgating_below)
-
-    def _fuel(self, step: Transition) -> Tensor:
-        """Return the mean fuel rate of all vehicles (mL/s), saturated from 5 towards 10."""
-        state = step.after.state
-        rate = metrics.fuel(state.speed, state.accel, self.fuel_model).mean(-1, keepdim=True)
-        return -floored(-rate, -_FUEL, -2.0 * _FUEL)
 
     def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return rings of drawn lengths: standing at equal gaps, or in a wave."""
@@ -217,15 +186,12 @@ class RingTask(Task):
             shift = amplitude * free * (ripple.cumsum(-1) - ripple)
             speed = (free * (1.0 + amplitude * ripple.roll(1, -1)) - 2.0).clamp_min(0.0)
         position = -place * length - shift
-        state = self.simulator.state(
-            position,
+        speed, step = (
             speed.expand_as(position).contiguous(),
-            params,
-            length=self.vehicle_length,
-            circumference=length.squeeze(-1),
-            step=torch.full((len(length),), -self.warmup, device=length.device),
+            torch.full((len(length),), -self.warmup, device=like.device),
         )
-        return EnvState(state, self._shocks(draw))
+        around: dict[str, Any] = {"length": self.vehicle_length, "circumference": length.squeeze(-1)}
+        return EnvState(self.simulator.state(position, speed, params, step=step, **around), self._shocks(draw))
 
     @cached_property
     def _leaders(self) -> tuple[int, ...]:

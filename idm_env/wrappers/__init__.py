@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from idm_env.wrappers.fitting import ParameterFitting as ParameterFitting
 from idm_env.wrappers.statistics import (
-    NormalizeObservation as NormalizeObservation,
-    RecordEpisodeStatistics as RecordEpisodeStatistics,
     VectorNormalizeObservation as VectorNormalizeObservation,
     VectorRecordEpisodeStatistics as VectorRecordEpisodeStatistics,
 )

@@ -1,14 +1,12 @@
 """Episode statistics and normalised observations for torch output: Gymnasium's own cannot carry gradients.
 
-One pair of wrappers for single environments, one for vectors; the statistics themselves are detached, what passes
-through keeps its graph.
+For vectors, of one environment too: the statistics are detached, what passes through keeps its graph.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from torch import Tensor
@@ -38,66 +36,13 @@ class Moments:
         return (rows - mean) * scale
 
 
-class _Normalising:
-    """Observations less their running mean, over their running deviation."""
+class VectorNormalizeObservation(VectorWrapper):
+    """Normalise the observations of a vector ``(environments, …)`` by running moments, ``final_obs`` included.
 
-    moments: Moments
+    ``update_running_mean = False`` freezes the moments. Observations have no unit any more.
+    """
+
     update_running_mean = True
-
-    def _normalised(self, rows: Tensor) -> Tensor:
-        if self.update_running_mean:
-            self.moments.update(rows)
-        return self.moments.normalise(rows)
-
-
-class NormalizeObservation(_Normalising, gymnasium.Wrapper):
-    """Normalise the observations of one environment by running moments; ``update_running_mean=False`` freezes them.
-
-    Observations keep the shape of the environment's ``observation_space``, and have no unit any more.
-    """
-
-    def __init__(self, env: gymnasium.Env, epsilon: float = 1e-8) -> None:
-        super().__init__(env)
-        self.moments = Moments(env.observation_space.shape or (), epsilon)
-
-    def reset(self, **keywords: Any) -> tuple[Tensor, dict[str, Any]]:
-        """Reset, and return the normalised observation."""
-        observation, info = self.env.reset(**keywords)
-        return self._normalised(observation.unsqueeze(0)).squeeze(0), info
-
-    def step(self, action: Any) -> tuple[Tensor, Any, bool, bool, dict[str, Any]]:
-        """Step, and return the normalised observation with its graph."""
-        observation, *rest = self.env.step(action)
-        return (self._normalised(observation.unsqueeze(0)).squeeze(0), *rest)  # type: ignore[return-value]
-
-
-class RecordEpisodeStatistics(gymnasium.Wrapper):
-    """Add ``info["episode"]`` with the return ``r`` and the length ``l`` at the end of an episode.
-
-    Observations keep the shape of the environment's ``observation_space``.
-    """
-
-    def __init__(self, env: gymnasium.Env) -> None:
-        super().__init__(env)
-        self._sum, self._steps = 0.0, 0
-
-    def reset(self, **keywords: Any) -> tuple[Tensor, dict[str, Any]]:
-        """Reset, and count from zero."""
-        self._sum, self._steps = 0.0, 0
-        return self.env.reset(**keywords)
-
-    def step(self, action: Any) -> tuple[Tensor, Any, bool, bool, dict[str, Any]]:
-        """Step, and count; the reward keeps its graph, the statistics have none."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._sum += float(reward.detach() if isinstance(reward, Tensor) else reward)
-        self._steps += 1
-        if terminated or truncated:
-            info = {**info, "episode": {"r": self._sum, "l": self._steps}}
-        return observation, reward, terminated, truncated, info
-
-
-class VectorNormalizeObservation(_Normalising, VectorWrapper):
-    """Normalise the observations of a vector ``(environments, …)`` by running moments, ``final_obs`` included."""
 
     def __init__(self, env: VectorEnv, epsilon: float = 1e-8) -> None:
         super().__init__(env)
@@ -107,6 +52,11 @@ class VectorNormalizeObservation(_Normalising, VectorWrapper):
         """Reset, and return the normalised observations."""
         observation, info = self.env.reset(**keywords)
         return self._normalised(observation), info
+
+    def _normalised(self, rows: Tensor) -> Tensor:
+        if self.update_running_mean:
+            self.moments.update(rows)
+        return self.moments.normalise(rows)
 
     def step(self, actions: Any) -> tuple[Tensor, Any, Any, Any, dict[str, Any]]:
         """Step, and return the normalised observations with their graph."""

@@ -76,10 +76,10 @@ HEAD = (
 NAMES = ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed")
 RING = {
     "task": "ring", "dt": 0.1, "integration": "ballistic", "noise": 0.2, "warmup": 750, "warmup_pool": 256,
-    "tailgating": 5.0, "tailgating_below": 1.0, "max_command": 3.0,
+    "reward": {"speed": 0.2, "effort": -4.0, "tailgating": -5.0}, "max_command": 3.0,
 }  # fmt: skip
 
-GUARDED: Row = {"failsafe": FAILSAFE, "max_command": [-4.5, 2.6], "tailgating": 0.0}
+GUARDED: Row = {"failsafe": FAILSAFE, "max_command": [-4.5, 2.6], "reward": {"speed": 0.2, "effort": -4.0}}
 REMEMBERING: Row = {"history": (5.0, 30.0), "window": 1200, "explore": 0.02}
 """What ``--guarded`` changes in environments and in APG."""
 

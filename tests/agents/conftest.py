@@ -12,8 +12,8 @@ from stable_baselines3.common.logger import Logger
 from agents.monitor import make_logger
 
 RING: dict[str, Any] = {
-    "task": "ring", "vehicles": 8, "length": [60.0, 75.0], "warmup": 20, "warmup_pool": 8, "reward": "flow",
-    "tailgating": 5.0, "shock": 0.0, "max_episode_steps": 60,
+    "task": "ring", "vehicles": 8, "length": [60.0, 75.0], "warmup": 20, "warmup_pool": 8,
+    "reward": {"speed": 0.2, "effort": -4.0, "tailgating": -5.0}, "shock": 0.0, "max_episode_steps": 60,
 }  # fmt: skip
 
 

@@ -27,9 +27,7 @@ CASES = {
         "ring",
         {
             "warmup": 5,
-            "fuel": 0.1,
             "reward": "flow",
-            "tailgating": 1.0,
             "controlled": 3,
             "failsafe": 3.0,
             "integration": "euler",

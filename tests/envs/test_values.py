@@ -27,8 +27,6 @@ CASES = [
         {
             "warmup": 5,
             "reward": "flow",
-            "fuel": 0.1,
-            "tailgating": 1.0,
             "controlled": 3,
             "failsafe": 3.0,
             "integration": "euler",

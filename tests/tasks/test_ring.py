@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from idm_env import metrics
 from idm_env.effects.idm import equilibrium_speed
 from idm_env.tasks import Draw, make_task
 
@@ -180,18 +179,14 @@ def test_the_driver_opposite_is_no_agent_and_a_wrong_one_is_told():
             make_task("ring", **keywords)
 
 
-@pytest.mark.parametrize("below", [0.8, 1.1])
-def test_tailgating_and_fuel_cost(below):
-    plain = make_task("ring", warmup=30, reward="flow")
-    dear = make_task("ring", warmup=30, reward="flow", tailgating=3.0, tailgating_below=below, fuel=2.0)
+def test_tailgating_costs_as_the_catalogue_says():
+    flow = {"speed": 0.2, "effort": -4.0}
+    plain, dear = (make_task("ring", warmup=30, reward=flow | more) for more in ({}, {"tailgating": -3.0}))
     world, _ = start(plain)
     close = world._replace(state=world.state._replace(gap=torch.full_like(world.state.gap, 0.4)))
     none = torch.zeros(1, 1, dtype=torch.float64)
     difference = plain.rewards(close, none, close) - dear.rewards(close, none, close)
-    fuel = float(metrics.fuel(close.state.speed, close.state.accel).mean())
-    assert float(difference) == pytest.approx(
-        3.0 * (1.0 - 0.4 / max(float(close.state.speed[0, 0]), 1.0) / below) + 2.0 * fuel
-    )
+    assert float(difference) == pytest.approx(3.0 * (1.0 - 0.4 / max(float(close.state.speed[0, 0]), 1.0)))
 
 
 def test_touching_ends_it():
