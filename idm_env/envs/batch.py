@@ -23,6 +23,7 @@ from idm_env.envs.beginnings import Beginnings
 from idm_env.envs.counters import Counters
 from idm_env.envs.given import checked
 from idm_env.envs.moves import Moves
+from idm_env.envs.recording import Recorder
 from idm_env.envs.settings import INFO, Settings
 from idm_env.kernels import dispatch
 from idm_env.scalar.record import Unordered, Untraceable
@@ -120,6 +121,7 @@ class Batch:
         self._seen: Any = None
         self._reasons: dict[int, str] = {}
         self.counters: Counters | None = None
+        self.recording: Recorder | None = None
         if isinstance(settings.task, OpenLanesTask) and (settings.task.loops or "stops" in settings.info):
             self.counters = Counters(settings.task, count, settings.device)
         self._draw: Draw | None = None
@@ -191,6 +193,8 @@ class Batch:
         seen = self._took(index, fresh, draw, every)
         if self.counters is not None:
             self.counters.begin(index, self.glance().state)
+        if self.recording is not None:
+            self.recording.begin(index, self.episodes, self.glance().state)
         return seen
 
     def _took(self, index: np.ndarray, fresh: EnvState, draw: Draw, every: bool) -> Tensor | np.ndarray:
@@ -364,6 +368,8 @@ class Batch:
         outcome = self._stepped(action, live, observed)
         if self.counters is not None and self.counters.loops:
             self.counters.after(self.glance().state)
+        if self.recording is not None:
+            self.recording.after(outcome.whole, self.episodes, self.glance().state)
         reasons = self.task.held > 1 and self.count > 1 and "crash" in outcome.details
         if reasons and self.settings.device.type == "cpu":  # elsewhere it is told from the worlds where the action ends
             for row in np.flatnonzero(np.asarray(outcome.terminated.any(-1))).tolist():

@@ -15,6 +15,7 @@ from torch import Tensor
 from idm_env import compat
 from idm_env.envs.batch import Batch
 from idm_env.envs.info import begun, single
+from idm_env.envs.recording import Recorder
 from idm_env.envs.settings import RENDER_MODES, Settings, affordable, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, observation_box
 from idm_env.envs.unrolled import Unrolled, unroll
@@ -39,7 +40,7 @@ def asked_of_make() -> int | None:
 
 
 class Pictures:
-    """Mixin: pictures of a batch's environments, and windows that go with their face."""
+    """Mixin: pictures and recordings of a batch's environments, and windows that go with their face."""
 
     task: Task
     batch: Batch
@@ -63,6 +64,17 @@ class Pictures:
         self._viewers = (*self._viewers, *(Viewer(self.render_mode, fps) for _ in missing))
         state, params = self.batch.glance().state, self.batch.episode_params()
         return [viewer.show(self.task, state, row, params) for row, viewer in enumerate(self._viewers[:count])]
+
+    def record(self) -> Recorder:
+        """Record every vehicle from now on; return a ``Recorder`` with the methods ``table()`` and ``write``.
+
+        ``recording.write("run.parquet")`` writes a trajectory file that ``idm-env plot``, ``fit`` and ``explain`` read.
+        """
+        batch = self.batch
+        batch.recording = Recorder(self.task, batch.count)
+        if batch.begun:
+            batch.recording.begin(np.arange(batch.count), batch.episodes, batch.glance().state)
+        return batch.recording
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the windows, if there are any."""
@@ -142,14 +154,16 @@ class Face(Pictures):
 
         Raises:
             RuntimeError: Before the first reset.
-            ValueError: For steps below 1 or beyond the memory, numpy output, ``hidden`` of other rows, and a policy
-                whose actions or hidden numbers are not finite or of another shape; with a compiled policy nothing has
-                changed then.
+            ValueError: While recording, for steps below 1 or beyond the memory, numpy output, ``hidden`` of other rows,
+                and a policy whose actions or hidden numbers are not finite or of another shape; with a compiled policy
+                nothing has changed then.
         """
         if not self.batch.begun:
             raise RuntimeError("unroll was called before reset. Call reset() first.")
         if self.batch.settings.output != "torch":
             raise ValueError("output = 'numpy' has no gradients to unroll. Make the environment with output='torch'.")
+        if self.batch.recording is not None:
+            raise ValueError("a window of unroll is not recorded. Call step() while recording, or make another batch.")
         mode = self.batch.settings.autoreset_mode
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(
