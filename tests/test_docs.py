@@ -274,7 +274,7 @@ def test_seven_questions_are_answered_two_clicks_from_the_readme() -> None:
     rows = re.findall(r"^\| (.+\?) \| \[.+\]\(([^)#]+)#?([^)]*)\) \|$", first, re.MULTILINE)
     words = {
         "../idm_env/tasks/": "", "jobs/files.md": "position_m", "../idm_env/effects/": "",
-        "architecture.md": "## Add a task", "jobs/train.md": "train_apg.py", "limits.md": "No GPU",
+        "architecture.md": "## Add a task", "jobs/train.md": "train_apg.py", "limits.md": "A GPU is for",
         "cards.md": "## Cite",
     }  # fmt: skip
     assert [page for _, page, _ in rows] == list(words)
