@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
 import idm_env  # noqa: F401
+from idm_env import backends
 from idm_env.tasks import TASKS, make_task
 
 
 @pytest.mark.parametrize("name", TASKS)
 def test_a_held_action_is_so_many_steps_under_it(name: str) -> None:
-    """Observations, ends and infos are those of the last of them, the reward and its parts are their means."""
+    """Observations, ends and infos are those of the last of them, the reward and its parts are their means.
+
+    A decision is a loop over steps, whatever steps: one task of one lane and one of several are compiled.
+    """
     choices = {"task": name, "controlled": 1, "warmup": 10} if name == "ring" else {"task": name, "controlled": 1}
-    once, held = (
-        gym.make("DiffIDM-v0", **choices, hold=hold, max_episode_steps=n) for hold, n in ((0.1, 12), (0.3, 4))
-    )
+    with contextlib.nullcontext() if name in ("ring", "highway") else backends.off():
+        once, held = (
+            gym.make("DiffIDM-v0", **choices, hold=hold, max_episode_steps=n) for hold, n in ((0.1, 12), (0.3, 4))
+        )
     np.testing.assert_array_equal(once.reset(seed=3)[0], held.reset(seed=3)[0])
     for k in range(4):
         action = held.action_space.sample() * 0 + np.float32(0.3 * (-1) ** k)
