@@ -10,7 +10,11 @@ from pathlib import Path
 
 import pytest
 
-EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
+from tests.test_wheel import LONG
+
+FOLDER = Path(__file__).resolve().parents[1] / "examples"
+EXAMPLES = [path for path in sorted(FOLDER.glob("*.py")) if path.stem not in LONG]
+"""All but those that tests/test_wheel.py runs, from the wheel."""
 NEEDS = {
     "train_rllib": {"tree": "RLlib pins another gymnasium and has an environment of its own: make rllib"},
     "export_minari": {"minari": "minari is not installed (pip install 'minari[create,hdf5]')"},

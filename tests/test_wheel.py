@@ -267,12 +267,23 @@ def of_core(example: Path) -> bool:
 
 
 CORE_EXAMPLES = [path.stem for path in sorted((ROOT / "examples").glob("*.py")) if of_core(path)]
+LONG = ("motorway", "stabilise_a_ring")
+"""Examples that take half a minute each by torch: they are run here once, and with no extra but numba."""
+SHORTER = {"train_apg": ("follow", "1")}
 
 
-@pytest.mark.parametrize("name", CORE_EXAMPLES)
+@pytest.mark.parametrize("name", [name for name in CORE_EXAMPLES if name not in LONG])
 def test_examples_that_need_no_extra_run_without_them(core: Path, tmp_path: Path, name: str) -> None:
     """From another folder, as a user does."""
-    assert call(core, ROOT / "examples" / f"{name}.py", at=tmp_path).stdout.strip()
+    assert call(core, ROOT / "examples" / f"{name}.py", *SHORTER.get(name, ()), at=tmp_path).stdout.strip()
+
+
+def test_long_examples_run_with_no_extra_but_numba(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    """They are no part of tests/test_examples.py."""
+    python, shared = environment(wheel, tmp_path / "environment", "kernels"), os.environ.get("IDM_ENV_CACHE", "")
+    for name in LONG:
+        done = call(python, ROOT / "examples" / f"{name}.py", at=tmp_path, IDM_ENV_CACHE=shared)
+        assert name in CORE_EXAMPLES and done.stdout.strip()
 
 
 def test_with_its_extra_the_command_runs_where_there_is_no_checkout(wheel: zipfile.ZipFile, tmp_path: Path) -> None:

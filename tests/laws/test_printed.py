@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from idm_env.effects import ALL, BASES, Effect, make
+from idm_env.effects import ALL, BASES, IDM, Brakes, CarFollowing, Effect, make
 from idm_env.effects.base import P
 from idm_env.kernels import dispatch
 from idm_env.parameters import Parameter
@@ -222,18 +222,38 @@ def test_a_hundred_steps_of_every_member(effect: Effect) -> None:
         agree(Case(simulator, kinks(), steps, torch.float64), 1e-12, 1e-11)
 
 
-@every
-def test_every_member_in_single_precision_on_a_ring(effect: Effect) -> None:
-    """Ring, midpoint, float32."""
-    simulator = around(effect, Ring(), integration="midpoint")
+def several() -> list[list[Effect]]:
+    """Return all members in groups of up to four that may drive together: no name twice, and one law of following."""
+    groups: list[list[Effect]] = []
+    for effect in (*MEMBERS, *MINE):
+        for group in groups:
+            laws = isinstance(effect, CarFollowing) and any(isinstance(e, CarFollowing) for e in group)
+            if len(group) < 4 and not laws and effect.name not in {e.name for e in group}:
+                group.append(effect)
+                break
+        else:
+            groups.append([effect])
+    return groups
+
+
+@pytest.mark.parametrize("effects", several(), ids=lambda group: " ".join(e.name for e in group))
+def test_every_member_in_single_precision_on_a_ring(effects: list[Effect]) -> None:
+    """Ring, midpoint, float32; four members share a program."""
+    laws = [e for e in effects if isinstance(e, CarFollowing)] or [IDM()]
+    others = [e for e in effects if not isinstance(e, CarFollowing)]
+    brakes = [] if any(isinstance(e, Brakes) for e in others) else [Brakes()]
+    simulator = Simulator(Ring(), (*laws, *brakes, *others), integration="midpoint")
     agree(Case(simulator, lively(simulator.road), 20, torch.float32), 2e-5, 1e-3)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize("integration", ["ballistic", "euler", "midpoint"])
-@pytest.mark.parametrize("road", [Lane(), Ring()], ids=["lane", "ring"])
+@pytest.mark.parametrize(
+    ("integration", "road", "dtype"),
+    [("ballistic", Lane(), torch.float64), ("ballistic", Ring(), torch.float32), ("euler", Ring(), torch.float64),
+     ("euler", Lane(), torch.float32), ("midpoint", Lane(), torch.float64), ("midpoint", Ring(), torch.float32)],
+    ids=str,
+)  # fmt: skip
 def test_all_effects_at_once(road: Road, integration: str, dtype: torch.dtype) -> None:
-    """Whole catalogue, every road, integration and precision."""
+    """Whole catalogue, every pair of roads, integrations and precisions."""
     simulator = together(road, integration)
     double = dtype == torch.float64
     agree(Case(simulator, lively(road), 10, dtype), *((1e-12, 1e-11) if double else (2e-5, 2e-3)))
