@@ -46,6 +46,9 @@ def refused(name: str, command: Any, folder: Path) -> dict[str, list[str]]:
     (folder / "broken.json").write_text("{")
     (folder / "short.csv").write_text("vehicle_id,seconds,position_m\n1,2,3\n")
 
+    rows = [f"{v},{i},{9 * (i % 8) + 99 * v}\n" for v in range(5) for i in range(40)]
+    (folder / "edges.csv").write_text("".join(["vehicle_id,time_s,position_m\n", *rows]))
+
     def with_file(given: str, *more: str) -> list[str]:
         where = [] if file is None else [f"--{file}"] if parameters[file].param_type_name == "option" else ["--"]
         flags = [*more, *where, *([] if file is None else [str(folder / given)])]
@@ -59,6 +62,7 @@ def refused(name: str, command: Any, folder: Path) -> dict[str, list[str]]:
         (folder / "nothing.csv").mkdir(exist_ok=True)
         if kind == "csv":
             found |= {"a broken parquet": with_file("broken.parquet"), "a missing column": with_file("short.csv")}
+            found["rows that cannot be"] = with_file("edges.csv")
     for option in (*refusals.CHOICES, "layout"):
         if option in parameters:
             found[f"--{option}"] = with_file(good, f"--{option.replace('_', '-')}", "nonsense")

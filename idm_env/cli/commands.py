@@ -32,6 +32,7 @@ class _Refusing(typer.core.TyperCommand):
         for name in options.FILES:
             if isinstance(ctx.params.get(name), list) and not ctx.params.get("each"):
                 _join(ctx.params, name)
+        refusals.refuse_whole(ctx.params)
         return super().invoke(ctx)
 
 

@@ -39,12 +39,9 @@ def _versions() -> list[Finding]:
         try:
             results.append(Finding(name, "ok", version(name)))
         except PackageNotFoundError:
-            if name == "idm-env":
-                results.append(
-                    Finding(name, "missing", "runs from a checkout that is not installed", "pip install -e .")
-                )
-            else:
-                results.append(Finding(name, "broken", "not installed", f"pip install {name}"))
+            absent = ("broken", "not installed", f"pip install {name}")
+            checkout = ("missing", "runs from a checkout that is not installed", "pip install -e .")
+            results.append(Finding(name, *(checkout if name == "idm-env" else absent)))
     return results
 
 

@@ -19,6 +19,8 @@ CHOICES = {
     "recipe": ("default", "paper"),
 }
 """Options of few words, and the words. Those who use them declare them; a test holds both together."""
+SMALL_BYTES, LARGE_BYTES = 1 << 20, 1 << 26
+"""Files up to the first are spooled, up to the second read as a whole before anything slow is imported."""
 
 
 def refuse(given: Mapping[str, Any]) -> None:
@@ -30,8 +32,11 @@ def refuse(given: Mapping[str, Any]) -> None:
     model = given.get("model")
     if model is not None and not Path(model).is_file():
         raise ValueError(f"{model} is not a file. Give the path of a YAML file.")
-    if given.get("scenarios"):
-        _scenarios([Path(path) for path in given["scenarios"]])
+    scenes: list[Path] = given.get("scenarios") or []
+    if len(scenes) == 1:
+        from idm_env.data import womd
+
+        next(womd.scenarios(scenes[0]), None)
     data = given.get("data", given.get("source"))
     if data is None or str(data[0] if isinstance(data, (list, tuple)) else data).endswith((".yaml", ".yml")):
         return
@@ -52,8 +57,29 @@ def refuse(given: Mapping[str, Any]) -> None:
         refuse_head(file, layout, names, given.get("place"), group, given.get("columns"))
 
 
-def _scenarios(paths: list[Path]) -> None:
-    from idm_env.data import womd
+def refuse_whole(given: Mapping[str, Any]) -> None:
+    """Read the one file of traffic of a command, or the copy of several; large ones are left to the command.
 
-    if len(paths) == 1:
-        next(womd.scenarios(paths[0]), None)
+    DataError for a file that it refuses as a whole. The trajectories are kept for the command.
+    """
+    data = given.get("data", given.get("source"))
+    path = Path(data[0] if isinstance(data, list) else data or "")
+    if "columns" not in given or given.get("each") or not path.is_file() or path.suffix in (".yaml", ".yml"):
+        return
+    options: dict[str, Any] = {name: given.get(name) for name in ("columns", "ring_length")} | {
+        "layout": given.get("layout", "auto")
+    }
+    is_filter = "recipe" in given
+    if path.stat().st_size > (SMALL_BYTES if is_filter else LARGE_BYTES):
+        return
+    if not is_filter:
+        from idm_env.data.load import hold
+
+        hold(path, place=given.get("place"), **options)
+        return
+    from tempfile import TemporaryDirectory
+
+    from idm_env.trajectories.spool import Spool
+
+    with TemporaryDirectory() as folder:
+        Spool(path, Path(folder) / "spool", chunk=200, **options)

@@ -51,10 +51,6 @@ def nearest_of(times: np.ndarray, ticks: np.ndarray) -> np.ndarray:
 
 def labels(table: pl.DataFrame, names: list[str], begin: int, end: int) -> dict[str, str]:
     """Return, as text, the columns that hold one value, and no empty cell, from row `begin` to `end`."""
-    constants = {}
     part = table.select(names).slice(begin, end - begin)
-    for name in names:
-        first = part[name][0]
-        if first is not None and part[name].n_unique() == 1:
-            constants[name] = str(first)
-    return constants
+    constant = [name for name in names if part[name][0] is not None and part[name].n_unique() == 1]
+    return {name: str(part[name][0]) for name in constant}

@@ -23,7 +23,9 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from idm_env.data import clock
 from idm_env.data.errors import DataError, Repair, missing_column, repaired
+from idm_env.data.schema import TRACK
 
 FRAME_S = 0.04
 FOOT_M = 0.3048
@@ -161,21 +163,12 @@ def i24(path: Path) -> Read:
         )
     table = pl.concat(parts)
     # Vehicles are sampled by their own clocks: one clock for all, so that leaders are measured at the same times.
-    table = _on_one_clock(table.with_columns(pl.col("time_s") - pl.col("time_s").min()))
-    return table, repaired("broken document", broken, "documents without a whole track were left out.")
-
-
-def _on_one_clock(table: pl.DataFrame) -> pl.DataFrame:
-    parts = []
-    for track in table.partition_by("run_id", "vehicle_id", maintain_order=True):
-        track = track.sort("time_s").unique("time_s", maintain_order=True)
-        time = track["time_s"].to_numpy()
-        ticks = np.arange(np.ceil(time[0] / FRAME_S - 1e-6), np.floor(time[-1] / FRAME_S + 1e-6) + 1)
-        clock = np.round(ticks * FRAME_S, 6)
-        nearest = np.clip(np.searchsorted(time, clock), 0, len(time) - 1)
-        position = np.interp(clock, time, track["position_m"].to_numpy())
-        parts.append(track[nearest].with_columns(pl.Series("time_s", clock), pl.Series("position_m", position)))
-    return pl.concat(parts)
+    table = table.with_columns(pl.col("time_s") - pl.col("time_s").min()).sort(*TRACK, "time_s")
+    runs = table["run_id"].unique()
+    table, _ = clock.regularise(
+        table.unique([*TRACK, "time_s"], maintain_order=True), dict.fromkeys(runs, FRAME_S), dict.fromkeys(runs, 0.0)
+    )
+    return table.drop("step"), repaired("broken document", broken, "documents without a whole track were left out.")
 
 
 def _need(frame: pl.DataFrame, names: tuple[str, ...], source: str) -> None:

@@ -27,6 +27,8 @@ HEAD_ROWS = 100
 """Rows that ``refuse_head`` reads."""
 REPAIRS: dict[Path, tuple[Repair, ...]] = {}
 """Repairs of files that were joined, by their copy."""
+_HELD: dict[tuple[object, ...], Trajectories] = {}
+"""What ``hold`` read, until it is asked for."""
 _MISSING = ["", "NA", "N/A", "NaN", "nan", "null", "None"]
 _LONGEST = 10_000_000  # characters of a line; a vehicle of pNEUMA's, who has one, takes a tenth
 _UNREADABLE = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, EOFError, UnicodeError, ValueError)
@@ -54,8 +56,10 @@ def load(
     Raises:
         DataError: If the file cannot be read or used; one line that names the value, the rule and the cure.
     """
-    frame, repairs = read(path, layout=layout, columns=columns)
     path = Path(path)
+    if (held := _HELD.pop(_key(path, ring_length, place, layout, columns), None)) is not None:
+        return held
+    frame, repairs = read(path, layout=layout, columns=columns)
     if any(repair.kind == drones.NO_LEADERS for repair in repairs):
         raise DataError(f"{path.name}: pNEUMA has no leaders, so that nobody follows anybody; filter takes it.")
     try:
@@ -63,6 +67,19 @@ def load(
     except pl.exceptions.PolarsError as error:
         # Types that no rule foresaw, such as lists in a parquet column, or one name twice.
         raise _unreadable(path, error) from error
+
+
+def hold(path: Path, **options: Any) -> None:
+    """Read a file as ``load`` does, whose DataErrors it raises, and keep it for the next one with these options."""
+    trajectories = load(path, **options)
+    _HELD.clear()
+    _HELD[_key(path, *(options[name] for name in ("ring_length", "place", "layout", "columns")))] = trajectories
+
+
+def _key(path: Path, *options: object) -> tuple[object, ...]:
+    """Return all that the trajectories of a file depend on."""
+    about = path.stat() if path.exists() else None
+    return str(path), about and (about.st_size, about.st_mtime_ns), *map(str, options)
 
 
 def files_of(paths: Sequence[Path]) -> list[Path]:
@@ -269,7 +286,7 @@ def _checked(path: Path) -> tuple[str, list[str], dict[str, Any]]:
         raise DataError(f"{path} does not exist; check the path.")
     extension = next((ending for ending in EXTENSIONS if path.name.lower().endswith(ending)), None)
     if extension is None:
-        cure = "save the sheet as csv" if path.name.lower().endswith((".xlsx", ".xls", ".ods")) else "use one of these"
+        cure = "save the sheet as csv" if path.name.lower().endswith((".xls", ".ods")) else "use one of these"
         raise DataError(f"{path.name} has an unknown extension; {cure}: {', '.join(EXTENSIONS)}.")
     if path.stat().st_size == 0:
         raise DataError(f"{path.name} is empty (0 bytes); it needs a header and rows.")

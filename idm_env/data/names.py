@@ -36,6 +36,8 @@ GUESSES = {
     "gap_m": r"gap|space_?gap|spacing|net_distance",
 }
 """What a column is perhaps called that has no tidy name."""
+MOST_ACROSS, WIDEST = 0.25, 12.0
+"""Vehicles that move across by such a share of their way, and one by more than three lanes (m), have turned."""
 _X, _V, _SENSOR = r"(x|s|y|pos|position|loc|local_?y)", r"(v|vel|velocity|spd|speed)", r"(radar|lidar|sensor)?_?"
 _WHO = {"follower": r"(f|fv|sv|fav|fol|foll|follower|following|ego|own|host|subject|self)",
         "leader": r"(l|lv|pv|lead|leader|leading|preceding|front|target)"}  # fmt: skip
@@ -111,11 +113,13 @@ def renamed(frame: pl.DataFrame, columns: Columns, source: str) -> tuple[pl.Data
     """Return the frame with the columns that were asked for under their tidy names, in SI units.
 
     Raises:
-        DataError: If a column is not there, a unit is unknown, or a cell is no number.
+        DataError: If a column is not there, a unit is unknown, a cell is no number, or the position is one coordinate
+            of vehicles that move along two.
     """
     repairs, taken, table = [], set(), frame
-    for name, source_column in pairs(columns):
-        column, factor = place(name, source_column, frame.columns, source)
+    places = {name: place(name, source_column, frame.columns, source) for name, source_column in pairs(columns)}
+    _check_plane(frame, {name: column for name, (column, _) in places.items()}, source)
+    for name, (column, factor) in places.items():
         table = table.with_columns(frame[column].alias(name))
         taken.add(column)
         if factor is not None:
@@ -161,7 +165,7 @@ def guessed(columns: list[str]) -> str:
         return f"--pair {shlex.quote(option)}"
     guesses: dict[str, str] = {}
     remarks = []
-    plane = is_plane(columns)
+    plane = coordinates(columns)
     for name, pattern in GUESSES.items():
         if name in columns:
             continue
@@ -202,10 +206,34 @@ def _pair(columns: list[str]) -> str:
     return ",".join(f"{name}={column}" for name, column in likely.items())
 
 
-def is_plane(columns: list[str]) -> bool:
-    """Tell whether a header has the two coordinates of a plane: x and y, as they are or as ``x_m``, ``xCenter``."""
+def coordinates(columns: list[str]) -> dict[str, str]:
+    """Return the columns of a header that are coordinates of a plane: x and y, as they are or as ``x_m``, ``xCenter``.
+
+    Nothing where one of them is missing.
+    """
     noise = r"[\[(].*|(?<=[xy])_?m$|[^a-z]|pos(ition)?|utm|local|center"
-    return {"x", "y"} <= {re.sub(noise, "", column.lower()) for column in columns}
+    plane = {axis: column for column in columns if (axis := re.sub(noise, "", column.lower())) in ("x", "y")}
+    return plane if len(plane) == 2 else {}
+
+
+def _check_plane(frame: pl.DataFrame, taken: Mapping[str, str], source: str) -> None:
+    """Raise DataError if the position is one coordinate of two, and vehicles move along the other one as well."""
+    plane, along, vehicle = (
+        coordinates(frame.columns),
+        taken.get("position_m", ""),
+        taken.get("vehicle_id", "vehicle_id"),
+    )
+    if along not in plane.values() or vehicle not in frame.columns:
+        return
+    across = next(column for column in plane.values() if column != along)
+    number = [pl.col(name).cast(pl.Float64, strict=False) for name in (along, across)]
+    ways = frame.group_by(vehicle).agg((x.max() - x.min()) for x in number)
+    total, sideways = (float(ways[name].sum()) for name in (along, across))
+    if sideways > MOST_ACROSS * total and (ways[across] > WIDEST).any():
+        raise DataError(
+            f"{source}: {along} is one of two coordinates: vehicles move by {total:.5g} along it and by {sideways:.5g} "
+            f"along {across}. position_m is the way along the road: project them on it first."
+        )
 
 
 def unread(columns: list[str]) -> list[Repair]:

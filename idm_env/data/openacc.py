@@ -81,15 +81,10 @@ def read(frame: pl.DataFrame, lines: list[str], run: str, source: str) -> tuple[
         part = _track(frame, slots[slot], clock, speed, start)
         names = facts["vehicles"]
         vehicle = names[slot - 1] if slot - 1 < len(names) else f"vehicle {slot}"
-        leader = None if gap is None else str(slot - 1)
-        parts.append(
-            part.with_columns(
-                pl.lit(str(slot)).alias("vehicle_id"),
-                pl.lit(leader, pl.String).alias("leader_id"),
-                pl.lit(vehicle).alias("vehicle_name"),
-                pl.Series("gap_m", np.full(len(clock), np.nan) if gap is None else gap, nan_to_null=True),
-            ).filter(pl.col("speed_mps").is_not_null())
-        )
+        leader = pl.lit(None if gap is None else str(slot - 1), pl.String)
+        gaps = pl.Series("gap_m", np.full(len(clock), np.nan) if gap is None else gap, nan_to_null=True)
+        names_of = {"vehicle_id": pl.lit(str(slot)), "leader_id": leader, "vehicle_name": pl.lit(vehicle)}
+        parts.append(part.with_columns(gaps, **names_of).filter(pl.col("speed_mps").is_not_null()))
     labels = [pl.lit(value).alias(name) for name, value in facts.items() if isinstance(value, str)]
     return pl.concat(parts).with_columns(pl.lit(run).alias("run_id"), pl.lit(1).alias("lane"), *labels), repairs
 
@@ -103,19 +98,12 @@ def _track(
         times, rates = clock[good], speed[good]
         moved = np.concatenate([[0.0], np.cumsum(np.diff(times) * (rates[1:] + rates[:-1]) / 2)])
         position[good] = start + moved
-    columns = [
-        pl.Series("time_s", clock),
-        pl.Series("position_m", position),
-        pl.Series("speed_mps", speed, nan_to_null=True),
-    ]
-    for key, new in _EXTRA.items():
-        if key in names:
-            text = key == "driver"
-            values = (
-                frame[names[key]].cast(pl.String) if text else pl.Series(_numbers(frame, names[key]), nan_to_null=True)
-            )
-            columns.append(values.alias(new))
-    return pl.DataFrame(columns)
+    extras = {
+        new: frame[names[key]].cast(pl.String) if key == "driver" else pl.Series(_numbers(frame, names[key]))
+        for key, new in _EXTRA.items() if key in names
+    }  # fmt: skip
+    columns = {"time_s": clock, "position_m": position, "speed_mps": speed, **extras}
+    return pl.DataFrame(columns).with_columns(pl.col(pl.Float64).exclude("time_s", "position_m").fill_nan(None))
 
 
 def _numbers(frame: pl.DataFrame, name: str) -> np.ndarray:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import atexit
 import gzip
-import io
 import re
 import shutil
 import tempfile
 import zipfile
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -23,16 +24,22 @@ import polars as pl
 from idm_env.data import ngsim
 from idm_env.data.errors import DataError
 
-ENDINGS = (".txt", ".tsv", ".fzp", ".xml", ".zip", ".txt.gz", ".xml.gz")
+ENDINGS = (".txt", ".tsv", ".fzp", ".xml", ".xlsx", ".zip", ".txt.gz", ".xml.gz")
 """Of files that are read by way of a copy, beside those of csv that need one."""
 _VISSIM = (
     "SIMSEC=time_s NO=vehicle_id LANE\\LINK\\NO=run_id LANE\\INDEX=lane POS=position_m SPEED=speed_kmh LENGTH=length_m"
 )
 VISSIM = dict(pair.split("=") for pair in _VISSIM.split())
 """Names of tidy columns for those of Vissim."""
-FCD = ("id", "pos", "lane", "speed", "leaderID", "type")
-"""Attributes of a vehicle of SUMO's that are read."""
-HEAD = 1 << 16
+FCD = {"id": "vehicle_id", "pos": "position_m", "speed": "speed_mps", "leaderID": "leader_id", "leaderGap": "gap_m"}
+FCD |= {"lane": "lane", "type": "vehicle_class"}
+"""Attributes of a vehicle of SUMO's that are read, and their tidy columns."""
+SUMO_LENGTHS_M = {"truck": 7.1, "trailer": 16.5, "bus": 12.0, "coach": 14.0, "delivery": 6.5, "motorcycle": 2.2}
+SUMO_LENGTHS_M |= {"moped": 2.1, "bicycle": 1.6, "scooter": 1.2}
+"""Lengths by vClass where a vType has none; 5 m for others."""
+TYPES_READ = 1 << 20
+"""Characters of a file of routes in which vTypes are looked for."""
+HEAD, TAB, NL = 1 << 16, "\t", "\n"
 _copies: dict[tuple[str, int, int], Path] = {}
 """Copies by file, size and time, until the process ends."""
 
@@ -44,10 +51,11 @@ def plain(path: Path) -> Path:
     if key not in _copies:
         with ExitStack() as files:
             text = _rewritten(path, files)
-        if text is None:
-            return path
-        copy = temporary() / (path.name if path.name.lower().endswith(".csv") else f"{path.name}.csv")
-        copy.write_text(text, encoding="utf-8")
+            if text is None:
+                return path
+            copy = temporary() / (path.name if path.name.lower().endswith(".csv") else f"{path.name}.csv")
+            with copy.open("w", encoding="utf-8") as file:
+                file.writelines(text)
         _copies[key] = copy
     return _copies[key]
 
@@ -59,9 +67,11 @@ def temporary() -> Path:
     return Path(folder)
 
 
-def _rewritten(path: Path, files: ExitStack) -> str | None:
-    """Return the text of a file as plain csv; None for a plain file."""
+def _rewritten(path: Path, files: ExitStack) -> Iterable[str] | None:
+    """Return the text of a file as plain csv, in parts; None for a plain file."""
     name = path.name.lower()
+    if name.endswith(".xlsx"):
+        return _of_sheet(path)
     raw: Any = files.enter_context(path.open("rb"))
     if name.endswith(".zip"):
         archive = files.enter_context(zipfile.ZipFile(raw))
@@ -72,7 +82,7 @@ def _rewritten(path: Path, files: ExitStack) -> str | None:
     file = files.enter_context(gzip.GzipFile(fileobj=raw)) if name.endswith(".gz") else raw
     head = file.read(HEAD)
     if head.lstrip()[:1] == b"<" or ".xml" in name:
-        return _of_sumo(path, io.BytesIO(head + file.read()))
+        return _of_sumo(path, head, file)
     encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
     lines = head.decode(encoding, "replace").removeprefix("\ufeff").splitlines()
     first = lines[0] if lines else ""
@@ -88,7 +98,7 @@ def _rewritten(path: Path, files: ExitStack) -> str | None:
     header = next((line for line in lines if line.startswith("$VEHICLE:")), None)
     rows = [line for line in lines if line.strip() and not line.startswith(("#", "$", "*"))]
     if header is not None:
-        return "\n".join([";".join(VISSIM.get(n, n) for n in header.partition(":")[2].split(";")), *rows]) + "\n"
+        return (f"{row}\n" for row in [";".join(VISSIM.get(n, n) for n in header.partition(":")[2].split(";")), *rows])
     if numbers and len(cells) not in ngsim.WITHOUT_HEADER:
         shown = ", ".join(cells[:4])
         raise DataError(f"{path.name}: the first line holds numbers, {shown} …: it has no header. Add a line of names.")
@@ -99,33 +109,76 @@ def _rewritten(path: Path, files: ExitStack) -> str | None:
         ]
     if trailing:
         rows = [first, *(row[:-1] for row in rows[1:])]
-    return "\n".join(row.replace(mark, "\t") if mark not in ("", ",", ";") else row for row in rows) + "\n"
+    return (f"{row.replace(mark, TAB) if mark not in ('', ',', ';') else row}\n" for row in rows)
 
 
-def _of_sumo(path: Path, file: io.BytesIO) -> str:
-    """Return floating-car data of XML as csv, under the names of SUMO."""
-    rows: list[list[str | None]] = []
-    time, root = "", ""
+def _of_sheet(path: Path) -> Iterable[str]:
+    """Return the first sheet of a workbook as csv. DataError for a broken one, and without a library that reads it."""
     try:
-        for event, element in ElementTree.iterparse(file, ("start", "end")):
-            root = root or element.tag
-            time = element.get("time", "") if element.tag == "timestep" else time
-            if event == "end" and element.tag == "vehicle":
-                rows.append([time, *map(element.get, FCD)])
-            if event == "end":
-                element.clear()
+        return [pl.read_excel(path).write_csv()]
+    except Exception as error:  # of libraries of their own kinds
+        cure = "save the sheet as csv" + (", or pip install fastexcel" if isinstance(error, ImportError) else "")
+        raise DataError(f"{path.name} cannot be read as a workbook ({str(error).partition(NL)[0]}); {cure}.") from None
+
+
+def _of_sumo(path: Path, head: bytes, file: Any) -> Iterator[str]:
+    """Yield floating-car data of XML line by line, under the names of SUMO, with the lengths of vehicles' types.
+
+    Attributes are those of the first vehicle.
+    """
+    lengths = _lengths(path, head.decode("utf-8", "replace"))
+    names: list[str] = []
+    time, root = "", ""
+    parser: Any = ElementTree.XMLPullParser(("start", "end"))
+    try:
+        for part in chain([head], iter(lambda: file.read(HEAD), b"")):
+            parser.feed(part)
+            for event, element in parser.read_events():
+                root = root or element.tag
+                if root != "fcd-export":
+                    raise DataError(f"{path.name} is XML of <{root}>; of SUMO's files that of --fcd-output is read.")
+                time = element.get("time", "") if element.tag == "timestep" else time
+                if event == "end" and element.tag == "vehicle":
+                    if not names:
+                        names = [name for name in FCD if name in element.attrib]
+                        yield TAB.join(["timestep_time", *(f"vehicle_{n}" for n in names), "vehicle_length"]) + "\n"
+                    length = lengths.get(element.get("type", ""), "")
+                    yield TAB.join([time, *(element.get(name, "") for name in names), length]) + "\n"
+                if event == "end":
+                    element.clear()
+        parser.close()
     except ElementTree.ParseError as error:
         raise DataError(f"{path.name} is no whole XML ({error}); is it complete?") from None
-    if root != "fcd-export":
-        raise DataError(f"{path.name} is XML of <{root}>; of SUMO's files that of --fcd-output is read.")
-    table = pl.DataFrame(rows, ["timestep_time", *(f"vehicle_{name}" for name in FCD)], orient="row")
-    return table.select(column for column in table if column.null_count() < table.height).write_csv()
+
+
+def _lengths(path: Path, head: str) -> dict[str, str]:
+    """Return the lengths (m) of vTypes by name, of the files that the head of SUMO's output names and that are there.
+
+    These are its routes and additional files, looked for beside it.
+    """
+    lengths: dict[str, str] = {}
+    for names in re.findall(r'<(?:route|additional)-files value="([^"]*)"', head):
+        for file in (path.parent / name for name in names.split(",")):
+            if file.is_file() and file.suffix == ".xml":
+                with file.open(encoding="utf-8", errors="replace") as text:
+                    tags = re.findall(r"<vType\s[^>]*>", text.read(TYPES_READ))
+                for kind in (dict(re.findall(r'(\w+)="([^"]*)"', tag)) for tag in tags):
+                    usual = str(SUMO_LENGTHS_M.get(kind.get("vClass", ""), 5.0))
+                    lengths[kind.get("id", "")] = kind.get("length", usual)
+    return {"DEFAULT_VEHTYPE": "5.0", **lengths} if lengths else {}
 
 
 def sumo(table: pl.DataFrame) -> pl.DataFrame:
-    """Return the tidy table of floating-car data: each edge is a run, whose lanes are numbered as in the file."""
+    """Return the tidy table of floating-car data: each edge is a run, whose lanes are numbered as in the file.
+
+    A gap below 0 is SUMO's word for nobody ahead.
+    """
     table = table.filter(pl.col("vehicle_id").is_not_null() & pl.col("vehicle_lane").is_not_null())
     parts = pl.col("vehicle_lane").cast(pl.String).str.extract_groups(r"^(?<run_id>.*)_(?<lane>\d+)$").struct.unnest()
-    names = {"timestep_time": "time_s", "vehicle_pos": "position_m", "vehicle_speed": "speed_mps"}
-    names |= {"vehicle_leaderID": "leader_id", "vehicle_type": "vehicle_class", "vehicle_id": "vehicle_id"}
-    return table.select(parts, *(pl.col(old).alias(new) for old, new in names.items() if old in table.columns))
+    names = {f"vehicle_{old}": new for old, new in FCD.items() if old != "lane"} | {"timestep_time": "time_s"}
+    names |= {"vehicle_length": "length_m"}
+    columns = [pl.col(old).alias(new) for old, new in names.items() if old in table.columns and table[old].count()]
+    rows = table.select(parts, *columns)
+    if "gap_m" not in rows.columns:
+        return rows
+    return rows.with_columns(pl.when(pl.col("gap_m").cast(pl.Float64) >= 0.0).then("gap_m").alias("gap_m"))

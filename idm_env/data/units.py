@@ -88,12 +88,10 @@ def _check_ratio(frame: pl.DataFrame, source: str, step: float | None) -> None:
     if ratio == 0:
         raise DataError(f"{source}: speed_mps is 0 while position_m rises; fill it, or remove the column.")
     factor, cure = min(_MISTAKES, key=lambda mistake: abs(math.log(ratio / mistake[0])))
-    if abs(ratio / factor - 1) < 0.1:
+    is_unit = abs(ratio / factor - 1) < 0.1
+    if is_unit or low > 1.33 or high < 0.75:
+        cure = cure if is_unit else "check their units"
         raise DataError(f"{source}: speed_mps is {ratio:.3g} times the change of position_m per second; {cure}.")
-    if low > 1.33 or high < 0.75:
-        raise DataError(
-            f"{source}: speed_mps is {ratio:.3g} times the change of position_m per second; check their units."
-        )
 
 
 def check_gaps(joined: pl.DataFrame, source: str) -> None:

@@ -142,15 +142,11 @@ def sentence(answer: Told) -> str:
 def _sorts(answer: Told) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for name in sorted(answer.found, key=lambda n: (bool(answer.found[n].why_not), -answer.gain[n])):
-        if why := answer.found[name].why_not or answer.steady.why_not:
-            rows.append({
-                "sort": name, "log_likelihood": None, "sigma": None, "tau_s": None, "note": f"not estimated: {why}",
-            })  # fmt: skip
-            continue
-        numbers = {str(row["name"]): row for row in answer.found[name].table()}
+        why = answer.found[name].why_not or answer.steady.why_not
+        numbers = {} if why else {str(row["name"]): row["estimate"] for row in answer.found[name].table()}
         rows.append({
-            "sort": name, "log_likelihood": answer.gain[name],
-            "sigma": numbers[f"{name}.sigma"]["estimate"], "tau_s": numbers[f"{name}.memory_time"]["estimate"],
-            "note": "",
+            "sort": name, "log_likelihood": None if why else answer.gain[name],
+            "sigma": numbers.get(f"{name}.sigma"), "tau_s": numbers.get(f"{name}.memory_time"),
+            "note": f"not estimated: {why}" if why else "",
         })  # fmt: skip
     return rows

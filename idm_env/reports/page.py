@@ -86,22 +86,13 @@ def table(
 
 
 def _cell(value: Any, digits: int | None = None) -> dict[str, Any]:
-    if isinstance(value, Cell):
-        sorted_by, finite = value.value, value.value is not None and abs(value.value) < float("inf")
-        sort_value = sorted_by if finite else None
-        return {"text": value.text, "number": sorted_by is not None, "value": sort_value, "marked": value.marked}
-    cell: dict[str, Any] = {"number": False, "value": None, "marked": False}
-    if isinstance(value, bool):
-        return cell | {"text": "yes" if value else "no"}
-    if isinstance(value, float):
-        return cell | {
-            "text": number(value, digits),
-            "number": True,
-            "value": value if abs(value) < float("inf") else None,
-        }
-    if isinstance(value, int):
-        return cell | {"text": str(value), "number": True, "value": value}
-    return cell | {"text": "" if value is None else str(value)}
+    if not isinstance(value, Cell):
+        words = ("no", "yes")[value] if isinstance(value, bool) else "" if value is None else str(value)
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        value = Cell(number(value, digits) if isinstance(value, float) else words, value if is_number else None)
+    finite = value.value is not None and abs(value.value) < float("inf")
+    has_value = {"number": value.value is not None, "value": value.value if finite else None}
+    return {"text": value.text, **has_value, "marked": value.marked}
 
 
 def number(value: float, digits: int | None = None) -> str:

@@ -162,11 +162,7 @@ def kalman(
     model["transition"] = np.array([[1.0, dt, dt * dt / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
     model["selection"] = np.eye(3)
     model["state_cov"] = density * np.array(
-        [
-            [dt**5 / 20, dt**4 / 8, dt**3 / 6],
-            [dt**4 / 8, dt**3 / 3, dt**2 / 2],
-            [dt**3 / 6, dt**2 / 2, dt],
-        ]
+        [[dt**5 / 20, dt**4 / 8, dt**3 / 6], [dt**4 / 8, dt**3 / 3, dt**2 / 2], [dt**3 / 6, dt**2 / 2, dt]]
     )
     model["design"] = np.array([[1.0, 0.0, 0.0]])
     model["obs_cov"] = np.array([[sigma * sigma]])

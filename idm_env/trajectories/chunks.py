@@ -84,14 +84,13 @@ def done(
     rows: list[dict[str, Any]]
     if settings.recipe == "paper":
         filtered, rows = _imitated(tracks, plan.dt, settings.fixed_parameters)
-        seconds, calibration = time.perf_counter() - begin, 0.0
+        seconds = time.perf_counter() - begin
     else:
         assert plan.noise is not None
         filtered = recipe(tracks, plan.dt, plan.noise, plan.options, recent) if tracks else []
         seconds = time.perf_counter() - begin
         on_stage(1 / stages, "drivers' parameters")
         rows = [] if settings.fixed_parameters else parameter_rows(filtered, recent, settings.model)
-        calibration = time.perf_counter() - begin - seconds
     tallies[OURS[settings.recipe]] = _tally([f.motion for f in filtered], tracks, seconds)
     for i, name in enumerate(others):
         on_stage((2 + i) / stages, f"to compare: {name}")
@@ -101,16 +100,8 @@ def done(
     total, new = overlaps(filtered, recent)
     parts.write(number, TRAJECTORIES, _table(filtered))
     parts.write(number, PARAMETERS, pl.DataFrame(rows, schema=PARAMETER_SCHEMA))
-    parts.finish(
-        number,
-        {
-            "tallies": {name: vars(tally) for name, tally in tallies.items()},
-            "overlaps": total,
-            "new_overlaps": new,
-            "calibration_seconds": calibration,
-            **remarks,
-        },
-    )
+    sums = {name: vars(tally) for name, tally in tallies.items()}
+    parts.finish(number, {"tallies": sums, "overlaps": total, "new_overlaps": new, **remarks})
     return filtered
 
 
@@ -165,11 +156,8 @@ def restored(parts: Parts, number: int, tracks: Sequence[TrackPiece]) -> list[Fi
     for track in tracks:
         rows = by_key[(track.run_id, track.vehicle_id, track.piece)]
         sigma = rows.select("position_sigma_m", "speed_sigma_mps", "accel_sigma_mps2").to_numpy()
-        filtered.append(
-            Filtered(
-                track, RegularMotion.from_table(rows), rows["imagined_gap_m"].to_numpy(), sigma,
-                rows["leader_id"].fill_null("").to_numpy(), rows["lane"].fill_null(-1).to_numpy(),
-                rows["gap_m"].to_numpy(),
-            )
-        )  # fmt: skip
+        filtered.append(Filtered(
+            track, RegularMotion.from_table(rows), rows["imagined_gap_m"].to_numpy(), sigma,
+            rows["leader_id"].fill_null("").to_numpy(), rows["lane"].fill_null(-1).to_numpy(), rows["gap_m"].to_numpy(),
+        ))  # fmt: skip
     return filtered

@@ -246,7 +246,7 @@ def _reaches(filtered: Filtered, tracks: Sequence[TrackPiece]) -> bool:
 def _report(spool: Spool, parts: Sequence[dict[str, Any]], settings: FilterSettings, plan: FilePlan) -> dict[str, Any]:
     """Return the report of all parts."""
     tallies: dict[str, Tally] = {}
-    totals = dict.fromkeys(("overlaps", "new_overlaps", "calibration_seconds"), 0.0)
+    totals = dict.fromkeys(("overlaps", "new_overlaps"), 0)
     lost = [item for part in parts for item in part["left_out"]]
     notes = [item for part in parts for item in part["notes"]]
     for part in parts:
@@ -269,9 +269,8 @@ def _report(spool: Spool, parts: Sequence[dict[str, Any]], settings: FilterSetti
         "divided": [{"vehicle": name, "note": note} for name, note in notes],
         "repairs": [{"kind": r.kind, "count": r.count, "text": r.text} for r in spool.repairs],
         "methods": [{"method": name, **tally.row()} for name, tally in tallies.items()],
-        "calibration_milliseconds_per_trajectory": 1e3 * totals["calibration_seconds"] / max(ours.tracks, 1),
-        "overlapping_rows": int(totals["overlaps"]),
-        "overlapping_rows_that_did_not_overlap_before": int(totals["new_overlaps"]),
+        "overlapping_rows": totals["overlaps"],
+        "overlapping_rows_that_did_not_overlap_before": totals["new_overlaps"],
         "account": account(((r.kind, r.count) for r in spool.repairs), [("tracks", len(lost))] if lost else []),
         "versions": versions(),
     }

@@ -62,12 +62,7 @@ def _row(
         for motion, track, index in zip(motions, tracks, out, strict=True)
     ])  # fmt: skip
     return {
-        "method": name,
-        "tracks": len(tracks),
-        "points": len(apart),
-        "spacing_s": spacing,
-        "rmse_m": float(np.sqrt(np.mean(apart**2))),
-        "mae_m": float(np.abs(apart).mean()),
-        "p95_m": float(np.percentile(np.abs(apart), 95)),
-        "bias_m": float(apart.mean()),
-    }
+        "method": name, "tracks": len(tracks), "points": len(apart), "spacing_s": spacing,
+        "rmse_m": float(np.sqrt(np.mean(apart**2))), "mae_m": float(np.abs(apart).mean()),
+        "p95_m": float(np.percentile(np.abs(apart), 95)), "bias_m": float(apart.mean()),
+    }  # fmt: skip

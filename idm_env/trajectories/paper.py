@@ -126,9 +126,8 @@ def _imitated(
         position, speed, accel = driven.position[own, i], driven.speed[own, i], driven.accel[1:][own, i]
         imagined = driven.inputs["imagined.gap"][own, i], driven.inputs["imagined.closing_speed"][own, i]
         loss = float(np.abs(position[steps[i]] - targets[i]).mean())
-        fits.append(
-            Imitated(RegularMotion(clock, position + track.position_m[0], speed, accel), values[i], *imagined, loss)
-        )
+        motion = RegularMotion(clock, position + track.position_m[0], speed, accel)
+        fits.append(Imitated(motion, values[i], *imagined, loss))
     return fits
 
 

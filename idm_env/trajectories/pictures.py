@@ -32,7 +32,7 @@ def space_time(written: Path, spool: Spool, bridge: float | None) -> list[page.B
         time, position, speed = (rows[name].to_numpy() for name in ("time_s", "position_m", "speed_mps"))
         lines.append(diagrams.VehicleLine(f"{vehicle}/{piece}", time, position, speed))
     fastest = 1.05 * max(float(line.speed.max()) for line in lines) or 1.0
-    both = [diagrams.Panel("the data", tuple(before)), diagrams.Panel("ours", tuple(lines))]
+    both = [diagrams.Panel("the data", tuple(before)), diagrams.Panel("filtered", tuple(lines))]
     words = f"run {run}" + (f", lane {lane}" if lane is not None else "")
     more = f", the first {len(names)} vehicles" if len(names) == MOST_VEHICLES else ""
     caption = (

@@ -47,19 +47,11 @@ def write_report(
     if figures:
         blocks += [page.heading("In space and time"), *figures]
     blocks += [page.heading("Methods on these data"), methods(report["methods"])]
-    blocks.append(
-        page.note(
-            "The position error rate is the mean distance to the data over the length of the track. It measures "
-            "closeness to noisy data, not to the truth: straight lines between samples have 0. Plausible "
-            "accelerations at a small rate are what is wanted."
-        )
-    )
-    blocks.append(
-        page.text(
-            f"Vehicles overlap their leader in {report['overlapping_rows']} rows; "
-            f"{report['overlapping_rows_that_did_not_overlap_before']} of them did not in the data."
-        )
-    )
+    words = "Position error rate: mean distance to the noisy data over the track's length; 0 for lines between samples."
+    blocks.append(page.note(words))
+    overlaps = report["overlapping_rows"]
+    raw = overlaps - report["overlapping_rows_that_did_not_overlap_before"]
+    blocks.append(page.text(f"{overlaps} rows with a negative gap, {raw} of them in the raw data too."))
     blocks += _parameters(parameters)
     blocks.append(page.heading("Before and after"))
     blocks += [page.picture(before_and_after(track, motion), f"Track {track.key}") for track, motion in shown]
@@ -76,13 +68,9 @@ def write_report(
 def _lead(report: dict[str, Any]) -> str:
     lost = len(report["left_out"])
     words = (
-        f"{report['tracks']} tracks of {report['vehicles']} vehicles, one result every {report['settings']['dt']} s. "
+        f"{report['tracks']} tracks of {report['vehicles']} vehicles, one result every {report['settings']['dt']} s."
     )
-    words += f"{lost} tracks were left out (below)." if lost else "No track was left out."
-    if report["calibration_milliseconds_per_trajectory"] > 0:
-        took = report["calibration_milliseconds_per_trajectory"]
-        words += f" Calibration of drivers behind their leaders took a further {took:.1f} ms per trajectory."
-    return words
+    return f"{words} {f'{lost} tracks were left out (below).' if lost else 'No track was left out.'}"
 
 
 def _noise(noise: dict[str, float]) -> str:
@@ -129,7 +117,7 @@ def methods(rows: Sequence[dict[str, Any]]) -> page.Block:
 
 
 def before_and_after(track: TrackPiece, motion: RegularMotion) -> Figure:
-    """Return position against the data, speed and acceleration over time: grey differences of the data, blue ours."""
+    """Return position against the data, speed and acceleration over time: grey raw differences, blue filtered."""
     figure = Figure(figsize=(10, 5.6), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True, height_ratios=(2, 3, 3))
     begin = track.time_s[0]
@@ -142,9 +130,9 @@ def before_and_after(track: TrackPiece, motion: RegularMotion) -> Figure:
     reach = max(0.05, 1.1 * float(np.abs(apart).max()))
     axes[0].set_ylim(-reach, reach)
     axes[0].axhline(0, color=AFTER, lw=1.2)
-    axes[0].set_ylabel("data − ours (m)")
+    axes[0].set_ylabel("raw − filtered (m)")
     axes[1].plot(middle, speed, color=BEFORE, lw=0.8, label="differences of the data")
-    axes[1].plot(clock, motion.speed_mps, color=AFTER, lw=1.5, label="ours")
+    axes[1].plot(clock, motion.speed_mps, color=AFTER, lw=1.5, label="filtered")
     axes[1].set_ylabel("speed (m/s)")
     axes[1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, ncols=2, borderaxespad=0.1)
     if len(speed) > 1:
@@ -171,14 +159,12 @@ def _parameters(parameters: pl.DataFrame) -> list[page.Block]:
         finite = parameters.filter(pl.col(p.name).is_not_null())
         low, middle, high = np.percentile(finite[p.name].to_numpy(), [25, 50, 75])
         identified = finite[f"{p.name}_identified"].drop_nulls()
-        rows.append(
-            {
-                "parameter": f"{p.symbol} {p.name}", "unit": p.unit, "median": float(middle),
-                "quartiles": f"{low:.2f} – {high:.2f}",
-                "told by the data": f"{100 * identified.to_numpy().mean():.0f} %" if len(identified) else "–",
-            }
-        )  # fmt: skip
-    words = f"Driver parameters of {finite.height} tracks. Dark: the data tell the value to within a half of itself."
+        rows.append({
+            "parameter": f"{p.symbol} {p.name}", "unit": p.unit, "median": float(middle),
+            "quartiles": f"{low:.2f} – {high:.2f}",
+            "identified": f"{100 * identified.to_numpy().mean():.0f} %" if len(identified) else "–",
+        })  # fmt: skip
+    words = f"Driver parameters of {finite.height} tracks. Dark: identified, to within a half of the value."
     return [
         page.heading("Driver parameters"),
         page.table(rows, digits={"median": 2}),
@@ -187,7 +173,7 @@ def _parameters(parameters: pl.DataFrame) -> list[page.Block]:
 
 
 def parameter_histograms(parameters: pl.DataFrame) -> Figure:
-    """Return histograms of the inferred parameters, those that the data tell in blue."""
+    """Return histograms of the inferred parameters, identified ones in blue."""
     figure = Figure(figsize=(10, 2.6), layout="constrained")
     for axis, p in zip(figure.subplots(1, 5), IDM.declared, strict=True):
         values = parameters[p.name].drop_nulls().to_numpy()
@@ -195,7 +181,7 @@ def parameter_histograms(parameters: pl.DataFrame) -> Figure:
         axis.hist(values, bins, color=BEFORE, label="all")
         identified = parameters.filter(pl.col(f"{p.name}_identified") & pl.col(p.name).is_not_null())[p.name].to_numpy()
         if len(identified):
-            axis.hist(identified, bins, color=AFTER, label="told by the data")
+            axis.hist(identified, bins, color=AFTER, label="identified")
         axis.set_xlabel(f"{p.symbol}: {p.name.replace('_', ' ')} ({p.unit})", fontsize=9)
         axis.tick_params(labelsize=8)
     figure.axes[0].set_ylabel("tracks", fontsize=9)

@@ -13,10 +13,8 @@ import numpy as np
 import polars as pl
 
 from idm_env.data import Repair
-from idm_env.data.schema import HIGHEST_SPEED_MPS, spans
+from idm_env.data.schema import spans
 
-SMALLEST_JUMP_M = 8.0
-"""A change of position is a jump only above this, whatever the time step (m)."""
 REVERSED_M = 3.0
 """A vehicle whose smoothed position falls by more than this drives backwards, which the simulator never does (m)."""
 
@@ -27,7 +25,7 @@ class TrackPiece:
 
     Attributes:
         run_id, vehicle_id: Identifiers, as text.
-        piece: Number of the stretch, from 0, where holes or jumps divide a vehicle's track.
+        piece: Number of the stretch, from 0, where holes divide a vehicle's track.
         time_s: Times of the samples (s), not necessarily regular.
         position_m: Front bumper along the lane (m), as measured.
         length_m: Length of the vehicle (m).
@@ -126,30 +124,13 @@ class Pieces:
             number += 1
             yield track
         if number > 1:
-            self.notes.append((name, f"divided into {number} tracks at holes or jumps"))
+            self.notes.append((name, f"divided into {number} tracks at holes"))
 
     def _spans(self, whole: TrackPiece) -> list[tuple[int, int]]:
-        """Return [begin, end) of stretches without a long hole or a lasting jump."""
+        """Return [begin, end) of stretches without a long hole; jumps are none of a vehicle (``data.plausible``)."""
         steps = np.diff(whole.time_s)
-        usual = float(np.median(steps))
-        cut = np.zeros(len(steps), bool) if self.bridge is None else steps > max(self.bridge, 2.5 * usual)
-        cut |= jumps(whole.time_s, whole.position_m)
-        return spans(~cut, np.ones(len(whole), bool))
-
-
-def jumps(time: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return [N − 1] where the position jumps and stays away: no vehicle moves so fast, and it does not come back.
-
-    A single sample that is off and back is an outlier for the noise model, not a cut.
-    """
-    far = np.maximum(SMALLEST_JUMP_M, HIGHEST_SPEED_MPS * np.diff(time))
-    away = np.abs(np.diff(position)) > far
-    for place in np.flatnonzero(away):
-        around = slice(max(0, place - 4), place + 1), slice(place + 1, place + 6)
-        before, after = (np.median(position[part]) for part in around)
-        between = np.median(time[around[1]]) - np.median(time[around[0]])
-        away[place] = abs(after - before) > max(SMALLEST_JUMP_M, HIGHEST_SPEED_MPS * between)
-    return away
+        longest = np.inf if self.bridge is None else max(self.bridge, 2.5 * float(np.median(steps)))
+        return spans(steps <= longest, np.ones(len(whole), bool))
 
 
 def reversing(track: TrackPiece) -> float:

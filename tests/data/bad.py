@@ -184,7 +184,7 @@ FILES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "not gzip": ("a.csv.gz", _bytes(b"\x1f\x8b\x08\x00rubbish"), "cannot be read"),
     "not parquet": ("a.parquet", _bytes(b"PAR1" + b"rubbish" * 20 + b"PAR1"), "cannot be read"),
     "cut gzip": ("a.csv.gz", _bytes(gzip.compress(PLATOON.write_csv().encode())[:-300]), "cannot be read"),
-    "an extension": ("a.xlsx", _bytes(b"x"), "unknown extension"),
+    "an extension": ("a.xls", _bytes(b"x"), "unknown extension"),
     "rubbish": ("a.csv", _bytes(bytes(range(256)) * 4), "a.csv"),
     "a column twice": ("a.csv", _bytes(b"vehicle_id,time_s,position_m,lane,lane\n1,0.0,1,2,3\n"), "'lane' is there"),
 }  # fmt: skip

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import gzip
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -315,7 +316,8 @@ REFUSED: dict[str, tuple[str, Callable[[Path], object], str]] = {
         lambda p: p.write_text(text() + '3,1,"2,1\n'),
         "line 20 has a quote that does not end: 3",
     ),
-    "a sheet": ("a.xlsx", lambda p: p.write_bytes(b"PK"), "save the sheet as csv"),
+    "a sheet": ("a.ods", lambda p: p.write_bytes(b"PK"), "save the sheet as csv"),
+    "a workbook": ("a.xlsx", lambda p: p.write_bytes(b"PK"), "save the sheet as csv, or pip install"),
     "no zip": ("a.zip", lambda p: p.write_bytes(b"PK"), "cannot be read"),
 }
 
@@ -331,16 +333,16 @@ def sumo_csv(path: Path) -> None:
     FCD.write_csv(path, separator=";")
 
 
-def sumo_xml(path: Path) -> None:
+def sumo_xml(path: Path, head: str = "", more: Mapping[str, str] = MappingProxyType({})) -> None:
     steps = []
     for (time,), rows in FCD.group_by("timestep_time", maintain_order=True):
         cars = "".join(
             f'<vehicle id="{r["vehicle_id"]}" x="1" y="2" speed="{r["vehicle_speed"]}" pos="{r["vehicle_pos"]}" '
-            f'lane="{r["vehicle_lane"]}"/>'
+            f'lane="{r["vehicle_lane"]}" {more.get(r["vehicle_id"], "")}/>'
             for r in rows.iter_rows(named=True)
         )
         steps.append(f'<timestep time="{time}">{cars}<person id="p" pos="1" edge="E0"/></timestep>')
-    content = f"<?xml version='1.0'?><fcd-export>{''.join(steps)}</fcd-export>".encode()
+    content = f"<?xml version='1.0'?>{head}<fcd-export>{''.join(steps)}</fcd-export>".encode()
     path.write_bytes(gzip.compress(content) if path.suffix == ".gz" else content)
 
 
@@ -363,6 +365,37 @@ def test_each_edge_of_sumo_is_a_road_of_its_own(tmp_path: Path) -> None:
     ahead = pl.when(pl.col("vehicle_id") == "f.2").then(pl.lit("f.0")).otherwise(pl.lit("")).alias("vehicle_leaderID")
     more.with_columns(ahead).write_csv(tmp_path / "c.csv", separator=";")
     assert leaders(load(tmp_path / "c.csv")) == {("f.0", None), ("f.2", "f.0")}
+
+
+def test_a_workbook_is_read_by_the_library_that_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.xlsx").write_bytes(b"PK")
+    monkeypatch.setattr(pl, "read_excel", lambda path: table())
+    chain_of(read_alike(tmp_path / "a.xlsx", tmp_path))
+
+
+def test_lengths_of_sumo_are_those_of_its_types_and_gaps_those_that_it_measures(tmp_path: Path) -> None:
+    """Types are read from the files that the head of the output names; gaps need no lengths."""
+    head = '<!-- <route-files value="r.xml,absent.xml"/> -->'
+    (tmp_path / "r.xml").write_text('<routes><vType id="lorry" length="12.0"/><vType id="bus" vClass="bus"/></routes>')
+    kind = {"f.0": 'type="lorry"', "f.2": 'type="bus"', "f.1": 'type="DEFAULT_VEHTYPE"'}
+    sumo_xml(tmp_path / "a.xml", head, kind)
+    found = read_alike(tmp_path / "a.xml", tmp_path).table
+    assert dict(found.select("vehicle_id", "length_m").rows()) == {"f.0": 12.0, "f.1": 5.0, "f.2": 12.0}
+    assert np.allclose(found["gap_m"].drop_nulls(), 35.0 - 12.0)
+    ahead = {"f.0": 'leaderID="" leaderGap="-1"', "f.1": 'leaderID="" leaderGap="-1"'}
+    sumo_xml(tmp_path / "b.xml", head, {**ahead, "f.2": 'leaderID="f.0" leaderGap="30.25"'})
+    measured = read_alike(tmp_path / "b.xml", tmp_path).table
+    assert set(measured["gap_m"].drop_nulls()) == {30.25} and measured["gap_m"].count() == 6
+
+
+def test_one_coordinate_of_two_is_no_position(tmp_path: Path) -> None:
+    """But it is on a straight road along it."""
+    both = table().with_columns(y=pl.col("position_m") * 1.0, z=0.5 * pl.col("time_s")).rename({"position_m": "x"})
+    both.write_csv(tmp_path / "a.csv")
+    assert "x is one of two coordinates" in refused(tmp_path / "a.csv", tmp_path, "position_m=x")
+    straight = both.with_columns(y=pl.col("z"))
+    straight.write_csv(tmp_path / "b.csv")
+    chain_of(read_alike(tmp_path / "b.csv", tmp_path, "position_m=x"))
 
 
 @pytest.mark.parametrize("columns", [18, 24])

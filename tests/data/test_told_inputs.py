@@ -41,6 +41,10 @@ REFUSED = {
     "sumo_fcd.csv": (NAMED, ["vehicles overlap in 6 of 12 rows: is a lane missing"]),
     "edge_positions.csv": (None, ["falls in 2 of 3 tracks", "from 200 to 0.2 m within 1 s", "--ring-length"]),
     "interaction_tracks.csv": (None, ["position_m=?", "x and y are two coordinates", "vehicle_id=track_id"]),
+    "interaction_tracks.csv ": (
+        "vehicle_id=track_id,time_s=timestamp_ms[ms],position_m=x,speed_mps=vx,length_m=length",
+        ["x is one of two coordinates", "the way along the road"],
+    ),
     "pneuma_slow.csv": (None, ["pNEUMA has no leaders", "filter takes it"]),
     "pair_wide.csv": (None, [f"--pair {WIDE[:27]}", "leader.position_m=x_l"]),
     "radar_log.csv": (None, [f"--pair '{RADAR[:11]}", "follower.speed_mps=VehSpd_kph[kph]"]),
@@ -69,7 +73,7 @@ def test_told_inputs_are_read_as_they_are_meant(name: str, told: Path) -> None:
 def test_told_inputs_are_refused_with_the_cure_that_helps(name: str, told: Path) -> None:
     columns, words = REFUSED[name]
     with pytest.raises(DataError) as caught:
-        load(told / name, columns=columns)
+        load(told / name.strip(), columns=columns)
     assert all(word in str(caught.value) for word in words), caught.value
     assert "position_m=x," not in str(caught.value)
 

@@ -15,7 +15,7 @@ from idm_env.data import DataError, Trajectories, episodes, load
 from idm_env.trajectories import spool as spool_module
 from idm_env.trajectories.files import filter_file
 from idm_env.trajectories.spool import Spool, read_table
-from idm_env.trajectories.tracks import Pieces, jumps
+from idm_env.trajectories.tracks import Pieces
 from tests.data.tables import platoon
 from tests.trajectories.tracks import read_frame
 
@@ -116,12 +116,6 @@ def test_a_file_without_positions_is_refused_in_one_line() -> None:
     )
     with pytest.raises(DataError, match="position_m is empty in every row"):
         read_frame(frame)
-
-
-def test_a_jump_stays_away_and_an_outlier_comes_back() -> None:
-    x = 10 * TIME
-    assert not jumps(TIME, x + 50.0 * (np.arange(100) == 40)).any()
-    assert np.flatnonzero(jumps(TIME, x + 50.0 * (np.arange(100) >= 40))).tolist() == [39]
 
 
 def test_laps_go_on_where_the_ring_has_its_start() -> None:
