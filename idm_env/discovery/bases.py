@@ -5,12 +5,11 @@ One of them is there once more, with the strengths of effects that are each driv
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 from idm_env.discovery import model as terms
-from idm_env.discovery.compare import ERRORS, Comparison, ErrorChange, compare
+from idm_env.discovery.compare import Comparison, ErrorChange, compare
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
@@ -20,12 +19,6 @@ from idm_env.effects import ALL, BASES, CarFollowing, base_named, make
 
 LEAST = 0.03
 """Least fall of the geometric mean of the errors for which a law is named first: it is chosen among several."""
-
-OWN = {"gap_rmse_m": 0.15, "horizon_rmse_m": 0.05}
-"""Least falls of errors of the very data, of which one has strengths of the drivers' own cross-fitted.
-
-Noise of 0.1 m/s² makes as much by chance: this only saves time.
-"""
 
 SCREENED = ("gap_rmse_m", "horizon_rmse_m")
 """Errors that tell by themselves which laws are far from the null."""
@@ -73,8 +66,8 @@ class Law(NamedTuple):
 
 
 def compared(
-    null: Hypothesis, first: Judged, judged: Callable[[Hypothesis], tuple[Judged, Judged]],
-    nearest: Callable[[Sequence[Hypothesis]], Hypothesis], seed: int, on_law: Callable[[int, int, str], None],
+    null: Hypothesis, first: Judged, judged: Callable[[Hypothesis], tuple[Judged, Judged]], seed: int,
+    on_law: Callable[[int, int, str], None],
 ) -> list[Law]:  # fmt: skip
     """Return all laws, that of the null first.
 
@@ -83,7 +76,6 @@ def compared(
         first: Its errors.
         judged: Calibrates and judges a model; also returns the null's errors that these are to be compared with:
             ``first``, or where a law ``is_far`` those of the very data that both are fitted to.
-        nearest: Returns which of some models, that of the null first, is cross-fitted.
         seed: Of the bootstrap.
         on_law: Called before each with its number, how many there are, and its title.
     """
@@ -93,7 +85,7 @@ def compared(
 
     def add(model: Hypothesis) -> None:
         law = model.catalogue.base
-        on_law(len(laws), 2 + len(others), law.title)
+        on_law(len(laws), len(laws) + 1, law.title)
         errors, of_null = judged(model)
         laws.append(Law(law, model, errors, compare(of_null, errors, seed), of_null is not first))
 
@@ -101,26 +93,21 @@ def compared(
         add(Hypothesis(null.terms, Catalogue(named, law, located=False)))
     # A better law comes first: what it lacks is sought, before anything is put down to its drivers.
     has_better = bool(best_of(laws).against)
-    alike = [] if has_better else [law for law in others if law.declared == own.declared]
-    add(nearest([personal(null, law) for law in (own, *alike)]))
+    add(personal(null, own))
+    if laws[-1].is_better and not has_better:
+        for law in others:
+            if law.declared == own.declared:
+                add(personal(null, law))
     return laws
 
 
-def is_far(law: Judged, null: Judged, has_null: bool = False) -> bool:
+def is_far(law: Judged, null: Judged) -> bool:
     """Tell whether a law is so far from better than the null that it needs no cross-fitting.
 
-    Each is fitted to the very data that are judged. A law errs by more than ``HOLDS`` more in all of ``SCREENED``; one
-    that ``has_null`` in it, with more parameters of the drivers' own, is not better by ``OWN`` in either than ``null``,
-    or than it with what was added.
+    Each is fitted to the very data that are judged, and errs by more than ``HOLDS`` more in all of ``SCREENED``.
     """
     errors, others = law.summary(), null.summary()
-    return all(errors[key] > (1.0 - OWN[key] if has_null else HOLDS) * others[key] for key in SCREENED)
-
-
-def distance(law: Judged) -> float:
-    """Return the product of the errors of ``SCREENED``."""
-    errors = law.summary()
-    return math.prod(errors[key] for key in SCREENED)
+    return all(errors[key] > HOLDS * others[key] for key in SCREENED)
 
 
 def personal(null: Hypothesis, law: CarFollowing) -> Hypothesis:
@@ -135,31 +122,6 @@ def best_of(laws: Iterable[Law]) -> Law:
     """Return the law that predicts best of those that are better than the null, or the null."""
     first, *others = laws
     return min((law for law in others if law.is_better), key=lambda law: law.mean_ratio, default=first)
-
-
-class Use(NamedTuple):
-    """The law that errs least in one error, ``key``, and how all its errors compare with those of what is chosen."""
-
-    key: str
-    law: Law
-    against: dict[str, Comparison]
-
-
-def uses(laws: Iterable[Law], chosen: Judged, seed: int) -> list[Use]:
-    """Return the errors in which another law is better than the model that is ``chosen``: beyond chance, by ``LEAST``.
-
-    Laws that were not judged where they were not calibrated do not count.
-    """
-    fair = [law for law in laws if law.against and not law.at_best and law.errors is not chosen]
-    compared = [(law, compare(chosen, law.errors, seed)) for law in fair]
-    result = []
-    for key in ERRORS:
-        better = [
-            (law, c) for law, c in compared if c[key].outcome is ErrorChange.BETTER and c[key].ratio < 1.0 - LEAST
-        ]
-        if better:
-            result.append(Use(key, *min(better, key=lambda pair: pair[1][key].ratio)))
-    return result
 
 
 def rows(laws: Iterable[Law]) -> list[LawErrors]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -100,11 +100,7 @@ def finished(
     before, of_laws = evaluation.of_null[1], evaluation
     laws: list[bases.Law] = []
     if before is not None:
-        reached = evaluation.reached(judgement.compared if judgement.added else None, last)
-        laws = bases.compared(
-            decided.null.model, before, partial(evaluation.against_null, reached=reached),
-            partial(evaluation.nearest, reached=reached), evaluation.seed, on_law,
-        )  # fmt: skip
+        laws = bases.compared(decided.null.model, before, evaluation.against_null, evaluation.seed, on_law)
     least = judge.least_m(evaluation.records)
     if judgement.is_exact(least):
         judgement = replace(judgement, added=False, refusal=judgement.refusal or Refusal(Reason.SMALL_SIZE, least))

@@ -26,13 +26,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from idm_env import Effect, Parameter
-from idm_env.effects.free import {features}
+from idm_env.effects.free import {imported}
 from idm_env.effects.places import interpolate
 '''
 _CLASS = '''
 
 @dataclass(frozen=True)
-class {name}(Effect):
+class {name}(OverFeature, Effect):
     """{equation}: c is piecewise linear in x, the {noun} ({unit}){ends}.
 
 {intervals}
@@ -42,6 +42,7 @@ class {name}(Effect):
     title: ClassVar[str] = "{title}"
     equation: ClassVar[str] = "{equation}"
     acts_on: ClassVar[str] = "{what}"
+    feature: ClassVar[str] = "{feature}"
     knots: ClassVar[tuple[float, ...]] = {knots}
     declared: ClassVar[tuple[Parameter, ...]] = (
 {declared}
@@ -49,11 +50,11 @@ class {name}(Effect):
 
     def {hook}:
         """Return {returns}."""
-        x = feature_of(scene, driver, "{feature}", {period})
+        x = self.x_of(scene, driver)
         heights = [
 {heights}
         ]
-        c = interpolate(x, self.knots, heights, {period}){share}
+        c = interpolate(x, self.knots, heights){share}
         return {result}
 '''
 
@@ -71,8 +72,8 @@ def source(terms: Sequence[tuple[Term, Mapping[str, ParameterEstimate]]], senten
     if not curves:
         return ""
     classes = [_class(term, parameters) for term, parameters in curves]
-    features = "feature_of, share_of" if any(t.by for t, _ in curves) else "feature_of"
-    return _HEAD.format(sentence=fill(sentence, 110), first=_name(curves[0][0]), features=features) + "".join(classes)
+    imported = "OverFeature, share_of" if any(t.by for t, _ in curves) else "OverFeature"
+    return _HEAD.format(sentence=fill(sentence, 110), first=_name(curves[0][0]), imported=imported) + "".join(classes)
 
 
 def _name(term: Term) -> str:
@@ -109,6 +110,6 @@ def _class(term: Term, parameters: Mapping[str, ParameterEstimate]) -> str:
         kind=f"found_{_kind(term)}", title=f"{CHANGES[term.what][2]} by {ALONG[term.coordinate]}",
         what=term.what, knots=knots, declared="\n".join(declared),
         hook="accelerate(self, scene, driver, p)" if added else "adapt(self, driver, scene, p)",
-        returns="c (m/s²)" if added else "the driver in force", feature=term.coordinate, period=term.period or None,
+        returns="c (m/s²)" if added else "the driver in force", feature=term.coordinate,
         heights=fill(inner, 110, **_DEEP), result="c" if added else f"driver._replace({changed})",
     )  # fmt: skip

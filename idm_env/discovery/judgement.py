@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -67,11 +66,6 @@ class Judgement:
     def mean_ratio(self) -> float:
         """Geometric mean of the ratios of errors on the test set, compared model / null; 1 where there is none."""
         return mean_ratio(self.errors)
-
-    @property
-    def corrected_is_best(self) -> bool:
-        """Whether the compared model predicts better than the null."""
-        return self.mean_ratio < 1.0
 
     @property
     def improves(self) -> bool:
@@ -152,7 +146,7 @@ class Judgement:
         )
         if self.law is not None:
             files = ["model_idm.yaml", *corrected, "model.yaml"]
-        elif self.beneath is None and self.compared is not None and self.corrected_is_best:
+        elif self.beneath is None and self.compared is not None and self.mean_ratio < 1.0:
             files = ["model_idm.yaml", "model.yaml"]
         titles = [*self.titles, *([self.law.title] if self.law is not None else [])]
         titles += [] if self.beneath is None else [self.beneath.titles[0]]
@@ -179,8 +173,6 @@ class Evaluation:
     seed: int
     whitened: bool | None = None
     """Which calibration predictions 5 s ahead have, where another model has said so (see ``crossed.crossed``)."""
-    bests: dict[int, tuple[judge.Judged, np.ndarray, Hypothesis]] = field(default_factory=dict)
-    """What ``_at_best`` has said, by id of the model, which is held here so that it stays its."""
 
     @cached_property
     def _fold(self) -> np.ndarray:
@@ -209,7 +201,12 @@ class Evaluation:
         return theta, errors
 
     def _crossed(
-        self, model: Hypothesis, values: np.ndarray, theta: np.ndarray, whitened: bool | None, pooled: bool = False
+        self,
+        model: Hypothesis,
+        values: np.ndarray,
+        theta: np.ndarray | None,
+        whitened: bool | None,
+        pooled: bool = False,
     ) -> judge.Judged:
         noise = self.searching.problem.noise
         assert noise is not None
@@ -223,52 +220,25 @@ class Evaluation:
         before = self.of_null[1]
         return self._judged(s, problem or self.searching.problem, None if before is None else before.whitened, pooled)
 
-    def reached(self, added: Solution | None, drivers: Solution) -> judge.Judged | None:
-        """Return the errors on the very data of the model ``added``, or else of the null, that own strengths must beat.
+    def against_null(self, model: Hypothesis) -> tuple[judge.Judged, judge.Judged]:
+        """Return the errors of another law, and those of the null that they are compared with (see ``bases``).
 
-        ``drivers`` have the parameters beside it. None where drivers do not adapt.
+        One with strengths of the drivers' own is always cross-fitted: of the very data it says nothing.
         """
-        if not self.adapt:
-            return None
-        if added is None:
-            return self._null_at_best
-        return crossed.at_best(self.records, added.model, added.values, drivers.theta)[0]
-
-    def against_null(self, model: Hypothesis, reached: judge.Judged | None = None) -> tuple[judge.Judged, judge.Judged]:
-        """Return the errors of another law, and those of the null that they are compared with (see ``bases``)."""
         before = self.of_null[1]
         assert before is not None
         if not self.adapt:
             errors = self.calibrated(model, self.null.values)[1]
             assert errors is not None
             return errors, before
-        of_null = self._null_at_best
-        at_best, theta = self._at_best(model)
-        if model.catalogue.personal:
-            is_far = bases.is_far(at_best, reached or of_null, has_null=True)
-        else:
-            is_far = bases.is_far(at_best, of_null) and not is_worth(at_best, of_null)
-        if is_far:
-            return at_best, of_null
+        theta = None
+        if not model.catalogue.personal:
+            of_null = self._null_at_best
+            at_best, theta = crossed.at_best(self.records, model, self.null.values)
+            if bases.is_far(at_best, of_null) and not is_worth(at_best, of_null):
+                return at_best, of_null
         values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
         return self._crossed(model, values, theta, before.whitened), before
-
-    def _at_best(self, model: Hypothesis) -> tuple[judge.Judged, np.ndarray]:
-        """Return ``crossed.at_best`` of another law, done once."""
-        if id(model) not in self.bests:
-            self.bests[id(model)] = (*crossed.at_best(self.records, model, self.null.values), model)
-        return self.bests[id(model)][:2]
-
-    def nearest(self, models: Sequence[Hypothesis], reached: judge.Judged | None) -> Hypothesis:
-        """Return of models with strengths of the drivers' own the one that is nearest to the very data.
-
-        That is the null's, the first, where drivers do not adapt, and where it hardly predicts better than what is
-        ``reached`` without.
-        """
-        first = models[0]
-        if reached is None or bases.is_far(self._at_best(first)[0], reached, has_null=True):
-            return first
-        return min(models, key=lambda model: bases.distance(self._at_best(model)[0]))
 
     def among(self, model: Hypothesis, wanted: np.ndarray) -> judge.Judged:
         """Return the errors of a law for the drivers of the records ``wanted`` [records], its population."""

@@ -41,7 +41,8 @@ BASE = IDM()
 SLOTS = 4
 """Curves and intervals without a name that a model can have at once."""
 NONE, CURVE, INTERVAL = 0, 1, 2
-PULSE = "pulse"
+PULSE, PAST = "pulse", "past"
+"""Slots of a pulse, and of the one curve over a feature of the past that a model can have."""
 PULSED = ("acceleration", "time_gap", "desired_speed", "accel_and_decel")
 """What a short pulse can change."""
 
@@ -109,8 +110,8 @@ class Catalogue:
     @cached_property
     def flagged(self) -> tuple[Effect, ...]:
         """Everything behind a flag, adaptations in the order in which they act."""
-        labels = [(label, False) for label in map(str, range(SLOTS))] + [(PULSE, True)]
-        slots = [kind for label, is_given in labels for kind in _slots(label, is_given)] if self.located else []
+        labels = (*map(str, range(SLOTS)), PAST, PULSE) if self.located else ()
+        slots = [kind for label in labels for kind in _slots(label)]
         return tuple(sorted((*self.effects, *slots), key=lambda e: e.rank if e.hook == "adapt" else 0))
 
     @cached_property
@@ -135,7 +136,8 @@ class Catalogue:
     def tables(self) -> dict[str, int]:
         """Number of the table of every slot ("0", "1", …) and of every effect with a profile."""
         profiles = [e.name for e in self.effects if e.sought in ("profile", "given")]
-        return {name: i for i, name in enumerate((*map(str, range(SLOTS if self.located else 0)), *profiles))}
+        unnamed = (*map(str, range(SLOTS)), PAST) if self.located else ()
+        return {name: i for i, name in enumerate((*unnamed, *profiles))}
 
     def table_at(self, name: str) -> int:
         """Return where a table begins in φ."""
@@ -155,8 +157,9 @@ class Catalogue:
         return effect.name, {f"{effect.name}.{name}": value for name, value in flags.items()}
 
 
-def _slots(label: str, is_given: bool = False) -> tuple[Effect, ...]:
-    return (*(Changed(label=label, given=is_given, targets=t) for t in SETS), Push(label=label, given=is_given))
+def _slots(label: str) -> tuple[Changed | Push, ...]:
+    choices = {"label": label, "given": label == PULSE, "past": label == PAST}
+    return (*(Changed(**choices, targets=t) for t in SETS), Push(**choices))  # type: ignore[arg-type]
 
 
 def _on_lap(effect: Effect, period: float) -> Effect:
@@ -291,7 +294,7 @@ def _recorded(catalogue: Catalogue, dt: float, graph: Regions) -> Recording:
     adjacent = [e.name for e in catalogue.effects if e.beyond == "vehicle in an adjacent lane"]
     inputs = [(name, tuple(_BESIDE), (False,) * len(_BESIDE)) for name in adjacent]
     inputs += [(e.name, ("",), (False,)) for e in (_slots(PULSE) if catalogue.located else ())]
-    memories = tuple(e.name for e in catalogue.effects if e.remembers)
+    memories = tuple(e.name for e in catalogue.flagged if e.remembers)
     stepping = CarFollowingStep(Lane(), (catalogue.base, *wrapped, Brakes()), dt, "midpoint")  # type: ignore[arg-type]
     return record(stepping, Form(tuple(inputs), memories, present=False), graph)
 

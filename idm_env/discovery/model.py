@@ -14,6 +14,7 @@ from idm_env.discovery import march
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.records import Records
 from idm_env.effects import Effect
+from idm_env.effects.free import HISTORY
 from idm_env.parameters import Parameter
 
 
@@ -59,11 +60,16 @@ class Term:
         """Whether this is a curve or an interval without a name, which takes a slot of the loop."""
         return self.effect is None
 
-    def entries(self, catalogue: Catalogue, slot: int) -> list[int]:
-        """Return the places in φ of the parameters, for a term without a name in ``slot``."""
+    @property
+    def past(self) -> bool:
+        """Whether this is a curve over a feature of the past."""
+        return self.located and self.coordinate in HISTORY
+
+    def entries(self, catalogue: Catalogue, table: str) -> list[int]:
+        """Return the places in φ of the parameters; ``table`` is the effect's or the slot's."""
         if self.form == march.NONE or self.profile is not None:
             return [catalogue.index[f"{self.effect}.{p.name}"] for p in self.parameters]
-        row = catalogue.table_at(self.effect or str(slot))
+        row = catalogue.table_at(table)
         if self.form == march.INTERVAL:
             return [row + 4, row, row + 1][: self.size]
         return [row + 4 + self.fades + i for i in range(self.size)]
@@ -92,12 +98,16 @@ class Hypothesis:
         object.__setattr__(self, "entries", np.array(entries, dtype=np.int64))
 
     @property
-    def _slots(self) -> list[tuple[Term, int]]:
-        """Terms with the slots of those that have no name."""
-        slots = np.cumsum([t.located for t in self.terms]) - 1
-        if len(slots) and slots[-1] >= march.SLOTS:
-            raise ValueError(f"a model can have {march.SLOTS} effects without a name, and {slots[-1] + 1} were given.")
-        return [(t, int(s)) for t, s in zip(self.terms, slots, strict=True)]
+    def _slots(self) -> list[tuple[Term, str]]:
+        """Terms with the names of their tables: the effect's, or the slot of one without a name."""
+        now, past = ([t for t in self.terms if t.located and t.past is p] for p in (False, True))
+        if len(now) > march.SLOTS or len(past) > 1:
+            raise ValueError(
+                f"a model can have {march.SLOTS} effects without a name and one more over the past, and {len(now)} and "
+                f"{len(past)} were given."
+            )
+        slots = iter(map(str, range(march.SLOTS)))
+        return [(t, t.effect or (march.PAST if t.past else next(slots))) for t in self.terms]
 
     def adding(self, term: Term) -> Hypothesis:
         """Return the model with one term more."""
@@ -133,11 +143,16 @@ class Hypothesis:
         return [self.catalogue.by_name[t.effect] for t in self.terms if t.effect is not None]
 
     @property
+    def at_work(self) -> list[Effect]:
+        """What the loop has for the terms."""
+        return [e for e, on in zip(self.catalogue.flagged, self.on, strict=True) if on]
+
+    @property
     def on(self) -> np.ndarray:
         """Flags [effects] of those that are at work."""
         on = np.zeros(len(self.catalogue.flags), np.int8)
         for term, slot in self._slots:
-            name = term.effect or self.catalogue.shape(term.what, term.coordinate, str(slot))[0]
+            name = term.effect or self.catalogue.shape(term.what, term.coordinate, slot)[0]
             on[self.catalogue.flags[name]] = 1
         return on
 
@@ -147,7 +162,7 @@ class Hypothesis:
         tables = np.array([(march.NONE, 2, self.catalogue.table_at(n)) for n in self.catalogue.tables], np.int64)
         for term, slot in self._slots:
             if term.form != march.NONE:
-                tables[self.catalogue.tables[term.effect or str(slot)], :2] = term.form, term.drawn[2]
+                tables[self.catalogue.tables[slot], :2] = term.form, term.drawn[2]
         return tables
 
     def phi(self, values: np.ndarray) -> np.ndarray:
@@ -159,7 +174,7 @@ class Hypothesis:
         for term, slot in self._slots:
             if term.form == march.NONE:
                 continue
-            row = self.catalogue.table_at(term.effect or str(slot))
+            row = self.catalogue.table_at(slot)
             phi[..., row + 3] = term.period
             if term.form == march.CURVE:
                 phi[..., row], phi[..., row + 1] = term.drawn[0], 1.0 / term.drawn[1]
@@ -168,7 +183,7 @@ class Hypothesis:
             else:
                 phi[..., row + 2] = EDGES[term.coordinate]
             if term.located:
-                for name, weight in self.catalogue.shape(term.what, term.coordinate, str(slot), term.by)[1].items():
+                for name, weight in self.catalogue.shape(term.what, term.coordinate, slot, term.by)[1].items():
                     phi[..., self.catalogue.index[name]] = weight
         phi[..., self.entries] = values
         return phi
@@ -176,7 +191,10 @@ class Hypothesis:
 
 SPREAD = 0.3
 """Prior width of a curve's knots, in units of what it changes: m/s², or relative."""
-STATES = {"speed": 3.0, "gap": 4.0, "closing_speed": 1.0, "lead_accel": 0.4, "relative_gap": 0.2}
+STATES = {
+    "speed": 3.0, "gap": 4.0, "closing_speed": 1.0, "lead_accel": 0.4, "relative_gap": 0.2, "time_since_stop": 10.0,
+    "mean_speed_20s": 3.0, "mean_speed_90s": 3.0, "braking_15s": 0.4, "lead_braking_15s": 0.4,
+}  # fmt: skip
 """Coordinates of the state, with the distance of a curve's knots: it ends where nobody was seen."""
 EDGES = {"position": 5.0, "time": 0.5, "speed": 0.5, "gap": 1.0, "closing_speed": 0.2, "lead_accel": 0.1}
 """Half-width over which an interval of a located effect sets in."""

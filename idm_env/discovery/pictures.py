@@ -129,8 +129,7 @@ def _residual(d: Discovery) -> list[np.ndarray]:
 
 def features(d: Discovery) -> Figure:
     """Binned means over position, time, and every state that a shape may run over."""
-    figure, axes = plt.subplots(2, 4, layout="constrained", figsize=(10.0, 4.8), sharey=True)
-    axes[1, 3].set_axis_off()
+    figure, axes = plt.subplots(3, 4, layout="constrained", figsize=(10.0, 7.2), sharey=True)
     for mend, colour, label in zip(_residual(d), (BEFORE, AFTER), d.judgement.titles, strict=False):
         for axis, (name, values) in zip(axes.ravel(), d.responses.coordinates.items(), strict=False):
             edges = np.unique(np.quantile(values, np.linspace(0.01, 0.99, 17)))
@@ -147,8 +146,7 @@ def features(d: Discovery) -> Figure:
             unit = FEATURES[name]
             axis.set_xlabel(words.ALONG[name] + ("" if unit == "1" else f" ({unit})"))
     figure.legend(handles=axes[0, 0].get_legend_handles_labels()[0], loc="outside upper left", ncols=2)
-    axes[0, 0].set_ylabel("residual (m/s²)")
-    axes[1, 0].set_ylabel("residual (m/s²)")
+    figure.supylabel("residual (m/s²)", fontsize=9)
     return figure
 
 
@@ -260,22 +258,4 @@ def gaps(d: Discovery) -> Figure | None:
         axis.set_ylabel("gap (m)")
     figure.legend(handles=axes[0].get_legend_handles_labels()[0], loc="outside upper left", ncols=3)
     axes[-1].set_xlabel("time (s)")
-    return figure
-
-
-def scatter(d: Discovery) -> Figure | None:
-    """Errors of both models, one point per follower of the test set."""
-    if d.judgement.before is None or d.judgement.compared is None:
-        return None
-    (plain, before, _, _), (corrected, after, _, _) = named(d)
-    ok = np.isfinite(before.gap_rmse)
-    x, y = before.gap_rmse[ok], after.gap_rmse[ok]
-    figure, axes = plt.subplots(layout="constrained", figsize=(4.4, 4.0))
-    axes.plot(x, y, "o", ms=4, color=AFTER, alpha=0.7)
-    reach = [0.9 * min(x.min(), y.min()), 1.1 * max(x.max(), y.max())]
-    axes.plot(reach, reach, color=TRUTH, lw=0.7)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_xlabel(f"gap RMSE, {plain} (m)")
-    axes.set_ylabel(f"gap RMSE, {corrected} (m)")
     return figure

@@ -83,6 +83,7 @@ def respond(problem: Problem, solution: Solution) -> Responses:
         "closing_speed": speed - records.column("lead_speed")[middle],
         "lead_accel": records.column("lead_accel")[middle],
         "relative_gap": relative_gap(solution, rows, middle),
+        **{name: x[middle] for name, x in records.past.items()},
     }
     linear = solution.linear
     matrix = equations(problem, solution.theta, linear)[1][:, : linear.own, : linear.own]

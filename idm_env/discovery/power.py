@@ -29,8 +29,6 @@ DRAWS = 200
 FACTORS = (1e-3, 1e2)
 """Strengths, in units of the usual one, between which the smallest is sought."""
 CLOSE = 1.05
-AGREED = 5.0
-"""Factor within which an interval and what would have been found must agree, for a strength to be called excluded."""
 BEYOND_LINES = 2.0
 """What lines leave out: candidates that show the same effect raise the level of the test along with it, and errors on
 runs kept back have their say. Held against simulations in ``studies/2026-11-22-planted-effects``, with 1.5. Of 14
@@ -157,20 +155,6 @@ class Strength:
     seen: float
     typical: float
     knots: int = 1
-
-    @property
-    def beyond(self) -> float:
-        """Distance from the null that the data exclude (95 %)."""
-        null = self.parameter.null or 0.0
-        return max(abs(self.low - null), abs(self.high - null))
-
-    @property
-    def is_agreed(self) -> bool:
-        """Whether what the interval excludes and what would have been found agree within a factor of ``AGREED``.
-
-        An interval is the curvature's: a few windows whose derivative explodes (standstill, clamps) make it tiny.
-        """
-        return self.seen / AGREED <= self.beyond <= self.seen * AGREED
 
 
 def strength_of(solution: Solution, problem: Problem, label: str, bar: Bar) -> Strength | None:

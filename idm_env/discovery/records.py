@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import torch
 
 from idm_env.data import DataError, Episode, Trajectories
 from idm_env.data.samples import VEHICLES, Samples
 from idm_env.discovery import march
+from idm_env.effects.free import HISTORY, first_history, next_history
 from idm_env.fitting.problem import group_of
 
 WINDOW_S = 5.0
@@ -52,6 +54,24 @@ class Records:
     def speed(self) -> np.ndarray:
         """Measured speed (m/s)."""
         return self.column("speed")
+
+    @cached_property
+    def past(self) -> dict[str, np.ndarray]:
+        """Features of ``HISTORY`` on the measured records [samples], each before the sample counts."""
+        begin, lengths = self.bounds[:-1], np.diff(self.bounds)
+        names = ("speed", "accel", "lead_accel")
+        columns = torch.from_numpy(np.stack([self.column(name) for name in names]))
+        order = np.argsort(-lengths, kind="stable")
+        begin, lengths = begin[order], lengths[order]
+        past = {name: np.empty(len(self.signals)) for name in HISTORY}
+        held = first_history(*columns[:, begin])
+        for i in range(int(lengths[0])):
+            going = begin[lengths > i]
+            held = {name: x[: len(going)] for name, x in held.items()}
+            for name, x in held.items():
+                past[name][going + i] = x.numpy()
+            held = next_history(held, self.dt, *columns[:, going + i])
+        return past
 
     def column(self, name: str) -> np.ndarray:
         """Return one of ``march.COLUMNS`` [samples]."""

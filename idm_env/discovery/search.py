@@ -234,8 +234,9 @@ class Search:
         worth: float = WORTH,
     ) -> list[Scored]:  # fmt: skip
         """Score curves by their linear response, and those that promise most, and ``worth``, by a fit."""
-        have, result = {t.label for t in solution.model.terms}, []
-        screened = [(t, *_line(responses, t)) for t in curves if t.label not in have]
+        have, result = {t.label: t for t in solution.model.terms}, []
+        past = any(t.past for t in have.values())  # of which there is one in a model
+        screened = [(t, *_line(responses, t)) for t in curves if t.label not in have and not (past and t.past)]
         screened.sort(key=lambda one: -one[2].mean())
         for i, (term, start, gains) in enumerate(screened):
             least = max(worth, NEAR * screened[0][2].mean())

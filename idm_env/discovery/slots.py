@@ -13,7 +13,17 @@ import torch
 from torch import Tensor
 
 from idm_env.effects.base import Effect, P
-from idm_env.effects.free import FEATURES, PER, DriverCurve, feature_of, share_of
+from idm_env.effects.free import (
+    FEATURES,
+    HISTORY,
+    PER,
+    DriverCurve,
+    OverFeature,
+    feature_of,
+    first_history,
+    next_history,
+    share_of,
+)
 from idm_env.effects.places import curve
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
@@ -36,15 +46,44 @@ BY = Parameter("by", "", "1", 0.0, 0.0, float(len(PER)), role="shape")
 """Which state a curve is proportional to: 1 and its place in ``PER``, 0 for none."""
 
 
+def _chosen(values: dict[str, Tensor], p: P) -> Tensor:
+    """Return which of the features' values is meant, 0 for none: the loop need not wait for what does not count."""
+    x: Any = 0.0
+    for feature, value in values.items():
+        x = torch.where(p["over"] == list(FEATURES).index(feature), value, x)
+    return x  # type: ignore[no-any-return]
+
+
+class _OverAny(OverFeature):
+    """Part of an effect that stands over any feature of the scene, or of the ``past``."""
+
+    past: bool
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the features are those of the past."""
+        return self.past
+
+    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor | None:
+        """Return the feature where nothing is known of the past."""
+        return _chosen(first_history(scene.speed, scene.accel, scene.leader.accel), p) if self.past else None
+
+    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the feature one step later."""
+        held = dict.fromkeys(HISTORY, scene.memory[self.name])
+        return _chosen(next_history(held, scene.dt, scene.speed, scene.accel, scene.leader.accel), p)
+
+
 def _value(effect: Slot | Push, scene: Scene, driver: Driver, p: P) -> Tensor:
     """Return c."""
     if effect.given:
         value: Tensor = scene.input(effect.name)
         return value
-    x: Any = 0.0
-    for number, feature in enumerate(FEATURES):
-        # Chosen, not summed: the loop need not wait for what does not count.
-        x = torch.where(p["over"] == number, feature_of(scene, driver, feature, None), x)
+    if effect.past:
+        x = scene.memory[effect.name]
+    else:
+        now = [f for f in FEATURES if f not in HISTORY]
+        x = _chosen({f: feature_of(scene, driver, f, None) for f in now}, p)
     share: Any = 1.0
     for number, state in enumerate(PER, 1):
         share = torch.where(p["by"] == number, share_of(scene, driver, state), share)
@@ -52,7 +91,7 @@ def _value(effect: Slot | Push, scene: Scene, driver: Driver, p: P) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Slot(Effect):
+class Slot(_OverAny, Effect):  # type: ignore[misc, override]
     """Some parameters of the driver times ``1 + c``: c a curve over one feature, or the input (``given``).
 
     Which feature and which parameters is said by parameters: ``over``, and 1 for what changes.
@@ -63,6 +102,7 @@ class Slot(Effect):
     label: str = ""
     targets: tuple[str, ...] = SETS[0]
     given: bool = False
+    past: bool = False
     knots: tuple[float, ...] = (0.0, 1.0)
     values: tuple[float, ...] = (0.0, 0.0)
 
@@ -84,13 +124,14 @@ class Slot(Effect):
 
 
 @dataclass(frozen=True)
-class Push(Effect):
+class Push(_OverAny, Effect):  # type: ignore[misc, override]
     """An added acceleration c, as in ``Slot``."""
 
     kind: ClassVar[str] = "push"
     declared: ClassVar[tuple[Parameter, ...]] = (OVER, BY)
     label: str = ""
     given: bool = False
+    past: bool = False
     knots: tuple[float, ...] = (0.0, 1.0)
     values: tuple[float, ...] = (0.0, 0.0)
 

@@ -89,11 +89,11 @@ class Problem:
         phi = np.ascontiguousarray(model.phi(values))
         on = np.tile(model.on, (copies, 1))
         pulse = np.zeros((copies, 3)) if pulse is None else march.pulsed(catalogue, pulse, on, phi)
-        loop = march.loop(catalogue, dt)
+        loop, working = march.loop(catalogue, dt), model.at_work
         loop.march(
             records.signals, records.bounds, rows.record, rows.start, rows.steps, rows.group, records.length,
-            np.exp(theta), phi, on, model.tables, march.back_steps(model.named, dt),
-            *march.lead_steps(model.named, dt), rows.every, dt, loop.varying, pulse, gap, speed,
+            np.exp(theta), phi, on, model.tables, march.back_steps(working, dt),
+            *march.lead_steps(working, dt), rows.every, dt, loop.varying, pulse, gap, speed,
         )  # fmt: skip
         return gap, speed
 

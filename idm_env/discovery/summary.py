@@ -67,7 +67,7 @@ def summarise(
         sentence = words.beside_noise(verdict, law, *left, judged.ladder)
     after = judged.after if judged.added else before
     sentence = " ".join(
-        filter(None, (*_of_laws(judged, laws, drivers[0] if judged.on is not None else drivers[2]), sentence))
+        filter(None, (*_of_laws(judged, drivers[0] if judged.on is not None else drivers[2]), sentence))
     )
     weight, beyond = decided.null_in_closed_loop, _against_first(judged)
     return result.Result(
@@ -79,7 +79,6 @@ def summarise(
             *words.details(verdict, added, nearest, 1.0 - float(np.exp(-first.smooth_gain))),
             *([words.beyond(judged.titles[-1], judged.beneath.titles[0], beyond)] if judged.beneath else []),
             *words.agreement(judged.ladder, first.leading),
-            *words.excluded(verdict, strengths),
             *words.cautions(data.at_bounds, data.drivers),
         ],
         found=added,
@@ -132,19 +131,16 @@ def _completed(judged: Judgement, against: dict[str, Comparison]) -> result.Comp
     return result.Completed(judged.on.law.kind, judged.on.title, list(judged.on.own), bases.against_rows(against))
 
 
-def _of_laws(judged: Judgement, laws: Sequence[bases.Law], drivers: Solution | None) -> list[str]:
+def _of_laws(judged: Judgement, drivers: Solution | None) -> list[str]:
     """Return what is said of laws before effects; ``drivers`` are the parameters of one that is better."""
-    null, best = judged.null.model.catalogue.base.title, judged.fleet or judged.law
+    null = judged.null.model.catalogue.base.title
     sentences = [] if judged.fleet is None else [words.fleet_first(judged.fleet)]
     if judged.on is not None and judged.beneath is not None:
         sentences.append(words.law_first(judged.on, judged.beneath.titles[0], drivers, "what it lacks follows"))
     if judged.law is not None:
         note = "" if judged.sought is None else words.none_holds(judged.sought.refusal, judged.sought.tried)
         sentences.append(words.law_first(judged.law, null, drivers, note))
-    chosen, name = (
-        (judged.of_all, judged.titles[-1 if judged.added else 0]) if best is None else (best.errors, best.title)
-    )
-    return sentences if chosen is None else [*sentences, words.by_use(bases.uses(laws, chosen, judged.seed), name)]
+    return sentences
 
 
 def _verdict(

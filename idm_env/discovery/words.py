@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from idm_env.discovery.bases import Law, Use
+from idm_env.discovery.bases import Law
 from idm_env.discovery.compare import Comparison, ErrorChange
 from idm_env.discovery.fleet import Kinds
 from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.model import Term
-from idm_env.discovery.power import Strength
 from idm_env.discovery.result import Ceilings, TermFinding, Weight
 from idm_env.discovery.score import Contrast
 from idm_env.discovery.shared import Shared
@@ -46,6 +44,9 @@ CHANGES = {
 ALONG = {
     "position": "place", "time": "time", "speed": "speed", "gap": "gap", "closing_speed": "closing speed",
     "lead_accel": "leader's acceleration", "relative_gap": "gap relative to the desired one",
+    "time_since_stop": "time since the last stop", "mean_speed_20s": "mean speed of the last 20 s",
+    "mean_speed_90s": "mean speed of the last 90 s", "braking_15s": "hardest braking of the last 15 s",
+    "lead_braking_15s": "leader's hardest braking of the last 15 s",
 }  # fmt: skip
 MANY = 4
 """A term with more parameters than this is a curve: its range is told instead."""
@@ -305,29 +306,6 @@ def details(verdict: Verdict, found: Sequence[TermFinding], nearest: Sequence[Te
     return parts
 
 
-def _below(strength: str) -> str:
-    """Say up to which strength nothing would be seen."""
-    return f"below {strength}" if strength else "of whatever strength"
-
-
-def excluded(verdict: Verdict, strengths: Mapping[str, Strength]) -> list[str]:
-    """Say which strengths of absent effects the data exclude, and which they would not have shown."""
-    if verdict not in (Verdict.NONE, Verdict.UNDECIDED, Verdict.CANNOT_TELL) or not strengths:
-        return []
-    bounds = [
-        f"{plain(name)} beyond {number(s.low, 2)} … {amount(float(f'{s.high:.2g}'), s.parameter.unit)}"
-        for name, s in strengths.items() if s.is_agreed
-    ]  # fmt: skip
-    unseen = [
-        f"{plain(name)} {_below(amount(float(f'{s.seen:.2g}'), s.parameter.unit) if math.isfinite(s.seen) else '')}"
-        for name, s in strengths.items()
-    ]
-    return [
-        *([f"Excluded (95 %): {'; '.join(bounds)}."] if bounds else []),
-        f"Would have been missed one time in five or more: {'; '.join(unseen)}, from what is without the effect.",
-    ]
-
-
 def cautions(at_bounds: Mapping[str, int], groups: int) -> list[str]:
     """Say what else speaks against the figures: parameters at their bounds."""
     return [
@@ -402,20 +380,6 @@ def none_holds(refusal: Refusal | None, tried: str) -> str:
 def beyond(model: str, null: str, against: Mapping[str, Comparison]) -> str:
     """Say what a better law with what was added to it does, against the law that was to be completed."""
     return f"Against {null}, {model}: {_changes(against)}."
-
-
-def by_use(uses: Sequence[Use], chosen: str) -> str:
-    """Say for which use another law than what is ``chosen``, by its title, is better beyond chance; "" for none."""
-    sentences = []
-    for key, law, against in uses:
-        worse = [ERRORS[k][0] for k, c in against.items() if c.outcome is ErrorChange.WORSE]
-        but = f"; it errs more in the {' and the '.join(worse)}" if worse else ""
-        c = against[key]
-        sentences.append(
-            f"For the {ERRORS[key][0]} {law.title} is better than {chosen}: {percent(c.ratio)} "
-            f"(95 %: {percent(c.low)} to {percent(c.high)}){but}."
-        )
-    return " ".join(sentences)
 
 
 def _of_drivers(drivers: Solution) -> list[str]:

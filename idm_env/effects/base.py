@@ -138,8 +138,9 @@ class Effect:
         for name in RETURNS if cls.own else ():
             if name in vars(cls):
                 setattr(cls, name, watched(name, vars(cls)[name]))
-        cls.remembers = cls.remember is not Effect.remember
-        if cls.remembers and "wind_up_s" not in vars(cls):
+        if not isinstance(cls.remembers, property):
+            cls.remembers = cls.remember is not Effect.remember
+        if cls.remembers is True and "wind_up_s" not in vars(cls):
             cls.wind_up_s = math.inf
 
     @property

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
+import torch
 from torch import Tensor
 
 from idm_env.effects.base import Effect, P
@@ -13,6 +15,14 @@ from idm_env.effects.places import along, curve
 from idm_env.parameters import Parameter, nearest
 from idm_env.types import Driver, Scene
 
+HISTORY: dict[str, str] = {
+    "time_since_stop": "s",
+    "mean_speed_20s": "m/s",
+    "mean_speed_90s": "m/s",
+    "braking_15s": "m/s²",
+    "lead_braking_15s": "m/s²",
+}
+"""Features of the past, with their units: numbers that a driver carries along (``next_history``)."""
 FEATURES: dict[str, str] = {
     "position": "m",
     "time": "s",
@@ -21,12 +31,15 @@ FEATURES: dict[str, str] = {
     "closing_speed": "m/s",
     "lead_accel": "m/s²",
     "relative_gap": "1",
+    **HISTORY,
 }
-"""Features that a curve can run over, with their units."""
+"""Features that a curve can run over, with their units: those of the scene first."""
 PER: dict[str, float] = {"speed": 15.0, "gap": 20.0, "closing_speed": 2.0, "lead_accel": 1.0, "relative_gap": 1.0}
 """What a curve may be proportional to: states, and how much of each counts as one, up to twice as much."""
 FREE = 3.0
 """Relative gap from which on a driver is free: a larger one is not told from it."""
+STOPPED, LONG_AGO = 0.5, 90.0
+"""Speed (m/s) up to which a driver stands, and time (s) after which a stop is forgotten, or was never seen."""
 
 Target = Literal["time_gap", "desired_speed", "max_accel", "comfort_decel", "min_gap"]
 
@@ -49,6 +62,63 @@ def feature_of(scene: Scene, driver: Driver, feature: str, period: float | None)
     return along(values[feature], period)
 
 
+def first_history(speed: Tensor, accel: Tensor, lead_accel: Tensor) -> dict[str, Tensor]:
+    """Return the features of ``HISTORY``, shape ``(…, vehicles)``, where nothing is known of the past.
+
+    There was no stop, one speed, and no other braking.
+    """
+    since = torch.where(speed > STOPPED, LONG_AGO, 0.0 * speed)
+    return dict(zip(HISTORY, (since, speed, speed, torch.relu(-accel), torch.relu(-lead_accel)), strict=True))
+
+
+def next_history(
+    held: dict[str, Tensor], dt: float, speed: Tensor, accel: Tensor, lead_accel: Tensor
+) -> dict[str, Tensor]:
+    """Return the features of ``HISTORY`` one step later, shape ``(…, vehicles)``, from those ``held`` and the present.
+
+    Time grows by Δt to ``LONG_AGO`` and is 0 while the driver stands; a mean over τ is ``(τ m + Δt v) / (τ + Δt)``; the
+    hardest braking ``max(−a, m τ / (τ + Δt))`` fades, τ = 15 s.
+    """
+    values = {
+        "time_since_stop": lambda m: torch.where(speed > STOPPED, (m + dt).clamp(0.0, LONG_AGO), 0.0 * m),
+        "mean_speed_20s": lambda m: m + (speed - m) * (dt / (20.0 + dt)),
+        "mean_speed_90s": lambda m: m + (speed - m) * (dt / (90.0 + dt)),
+        "braking_15s": lambda m: torch.maximum(-accel, m * (15.0 / (15.0 + dt))),
+        "lead_braking_15s": lambda m: torch.maximum(-lead_accel, m * (15.0 / (15.0 + dt))),
+    }
+    return {name: values[name](m) for name, m in held.items()}
+
+
+class OverFeature:
+    """Part of an effect that stands over one ``feature``: of one of the past it keeps a memory ``(…, vehicles)``."""
+
+    feature: str
+    name: Any
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the feature is one of the past."""
+        return self.feature in HISTORY
+
+    @property
+    def wind_up_s(self) -> float:
+        """The whole record, for what remembers."""
+        return math.inf if self.remembers else Effect.wind_up_s
+
+    def x_of(self, scene: Scene, driver: Driver, period: float | None = None) -> Tensor:
+        """Return the feature now, in the unit of ``FEATURES``."""
+        return scene.memory[self.name] if self.remembers else feature_of(scene, driver, self.feature, period)
+
+    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor | None:
+        """Return the feature where nothing is known of the past."""
+        return first_history(scene.speed, scene.accel, scene.leader.accel)[self.feature] if self.remembers else None
+
+    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the feature one step later."""
+        held = {self.feature: scene.memory[self.name]}
+        return next_history(held, scene.dt, scene.speed, scene.accel, scene.leader.accel)[self.feature]
+
+
 def share_of(scene: Scene, driver: Driver, state: str) -> Tensor:
     """Return by how much a curve counts in a state of ``PER``, shape ``(…, vehicles)``: ``x / per``, from −2 to 2."""
     return (feature_of(scene, driver, state, None) / PER[state]).clamp(-2.0, 2.0)
@@ -68,7 +138,7 @@ def _check(name: str, feature: str, knots: tuple[float, ...], by: str) -> None:
 
 
 @dataclass(frozen=True)
-class Curve(Effect):
+class Curve(OverFeature, Effect):  # type: ignore[misc, override]
     """An added acceleration ``+ Σ c_k hat_k(x)``, piecewise linear in one feature x of the scene, free at its knots.
 
     ``by`` another state it is proportional to that (``share_of``): with a curve without, a surface over two states.
@@ -100,13 +170,13 @@ class Curve(Effect):
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the curve's acceleration (m/s²)."""
-        x = feature_of(scene, driver, self.feature, self.period)
+        x = self.x_of(scene, driver, self.period)
         c = curve(x, p, "knot", self.knots, self.period)
         return c * share_of(scene, driver, self.by) if self.by else c
 
 
 @dataclass(frozen=True)
-class DriverCurve(Effect):
+class DriverCurve(OverFeature, Effect):  # type: ignore[misc, override]
     """One driver parameter times ``1 + Σ c_k hat_k(x)`` over one feature x: T(x), v0(t) and their kin.
 
     ``by`` and ``number`` are those of ``Curve``.
@@ -140,7 +210,7 @@ class DriverCurve(Effect):
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the target parameter changed."""
-        x = feature_of(scene, driver, self.feature, self.period)
+        x = self.x_of(scene, driver, self.period)
         change = curve(x, p, "knot", self.knots, self.period)
         change = change * share_of(scene, driver, self.by) if self.by else change
         return driver._replace(**{self.target: getattr(driver, self.target) * (1.0 + change)})

@@ -63,6 +63,11 @@ def places(records: Records) -> dict[str, tuple[Term, tuple[float, ...]]]:
             terms.curve("acceleration", "speed", 5.0, 5.0, 3, by="relative_gap"),
             (0.3, -0.2, 0.2),
         ),
+        "T over time since stop": (terms.curve("time_gap", "time_since_stop", 0.0, 30.0, 4), (0.4, 0.2, -0.2, 0.1)),
+        "v0 over mean speed": (terms.curve("desired_speed", "mean_speed_90s", 2.0, 4.0, 4), (-0.3, -0.2, 0.2, 0.1)),
+        "a and b over braking": (terms.curve("accel_and_decel", "braking_15s", 0.0, 0.5, 3), (-0.3, 0.4, 0.2)),
+        "push over leader's braking": (terms.curve("acceleration", "lead_braking_15s", 0.0, 0.5, 3), (0.2, -0.3, 0.1)),
+        "T over mean speed": (terms.curve("time_gap", "mean_speed_20s", 2.0, 4.0, 4), (-0.3, -0.2, 0.2, 0.1)),
         "push over phase": (terms.curve("acceleration", "time", 0.0, 4.0, 4, 16.0), (0.3, -0.2, 0.1, 0.2)),
     }
 

@@ -12,8 +12,9 @@ import torch
 from scipy.stats import t as student
 
 from idm_env.data import episodes, synthetic
-from idm_env.discovery import model as terms, search, selection
+from idm_env.discovery import model as terms, places, search, selection
 from idm_env.discovery.calibrate import first_prior
+from idm_env.discovery.march import COLUMNS
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.score import SYSTEMATIC, half_width, held_out
@@ -147,6 +148,38 @@ def test_a_curve_has_intervals_over_its_coordinate_in_it() -> None:
     ramp = terms.curve("time_gap", "time", 0.0, 200.0, 2, label="time_gap ramp")
     assert _same_class(zone, Hypothesis((profile,))) and not _same_class(profile, Hypothesis((zone,)))
     assert not _same_class(shift, Hypothesis((profile,))) and not _same_class(shift, Hypothesis((ramp,)))
+
+
+def test_the_past_of_a_record_is_what_a_driver_on_it_remembers(platoon: Records) -> None:
+    """Coordinates of curves are those that the loop winds up: here of one record, by definition."""
+    mine = slice(platoon.bounds[1], platoon.bounds[2])
+    slower = platoon.signals.copy()
+    slower[:, COLUMNS.index("speed")] -= np.quantile(platoon.speed[mine], 0.2)  # so that there are stops
+    speed, lead_accel = slower[mine, COLUMNS.index("speed")], platoon.column("lead_accel")[mine]
+    past = {name: x[mine] for name, x in replace(platoon, signals=slower).past.items()}
+    stops = [i for i in range(len(speed)) if speed[i] <= 0.5]
+    mean, hardest = speed[0], max(-lead_accel[0], 0.0)
+    for i in range(len(speed)):
+        since = 0.1 * (i - 1 - max((j for j in stops if j < i), default=-np.inf))
+        expected = min(since, 90.0) if i else 90.0 * (0 not in stops)
+        assert past["time_since_stop"][i] == pytest.approx(expected, abs=1e-6)
+        assert past["mean_speed_20s"][i] == pytest.approx(mean) and past["lead_braking_15s"][i] == pytest.approx(
+            hardest
+        )
+        mean, hardest = mean + (speed[i] - mean) * 0.1 / 20.1, max(-lead_accel[i], hardest * 15.0 / 15.1)
+    assert 0 < len(stops) < len(speed) and past["braking_15s"].max() > 0.5
+
+
+def test_a_model_has_one_curve_over_the_past(platoon: Records) -> None:
+    since, mean = (terms.curve("time_gap", c, 0.0, 5.0, 4) for c in ("time_since_stop", "mean_speed_90s"))
+    searching, null = begun(platoon, "drag")
+    solution = solve(searching.problem, Hypothesis((since,)), null.theta, np.zeros(4), iterations=1)
+    responses = places.respond(searching.problem, null)
+    before = held_out(searching.problem, null)
+    assert [s.term for s in searching._curves(solution, responses, before, 2, (mean,))] == []
+    assert [s.term for s in searching._curves(null, responses, before, 1, (mean,), np.inf)] == [mean]
+    with pytest.raises(ValueError, match="one more over the past, and 0 and 2 were given"):
+        Hypothesis((since, mean))
 
 
 CURVES = (

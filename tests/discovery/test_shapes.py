@@ -17,7 +17,7 @@ from idm_env.discovery.march import PULSED, Catalogue
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.result import ParameterEstimate
 from idm_env.effects import IDM, Brakes, Effect
-from idm_env.effects.free import PER
+from idm_env.effects.free import HISTORY, PER
 from idm_env.effects.registry import read
 from idm_env.model_file import load_model
 from idm_env.reports.undecided import FOUND
@@ -95,7 +95,7 @@ def test_a_model_may_name_the_file(closing: Discovery, tmp_path: Path) -> None:
     assert [e.name for e in load_model(tmp_path / "model.yaml").effects][1] == "time_gap_over_closing_speed"
 
 
-EVERY = list(product(PULSED, terms.STATES, ("", *PER)))
+EVERY = [*product(PULSED, [c for c in terms.STATES if c not in HISTORY], ("", *PER)), *product(PULSED, HISTORY, [""])]
 
 
 @pytest.mark.parametrize(("what", "coordinate", "by"), [x for x in EVERY if x[1] != x[2]])
@@ -123,7 +123,9 @@ def test_every_shape_is_the_same_in_its_file_and_in_the_model(
             params[effect] = {k: torch.tensor(x, dtype=torch.float64) for k, x in numbers.items()}
         state = simulator.state(position, speed, params)
         after = simulator.step(state, {}, params)  # so that leaders have accelerations
-        return simulator.acceleration(after, {}, params)
+        assert bool(effects) is bool(after.memory) or coordinate not in HISTORY
+        held = torch.linspace(0.0, 2.0 * terms.STATES[coordinate], 60, dtype=torch.float64)  # a lively past
+        return simulator.acceleration(after._replace(memory=dict.fromkeys(after.memory, held)), {}, params)
 
     mine, theirs = accelerations((of_file,), {}), accelerations(tuple(of_model), numbers)
     assert torch.allclose(mine, theirs, rtol=0.0, atol=1e-9)

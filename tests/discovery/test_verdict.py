@@ -14,7 +14,6 @@ import pytest
 from idm_env.data import Trajectories, episodes, synthetic
 from idm_env.discovery import (
     Discovery,
-    bases,
     compare,
     crossed,
     discover,
@@ -32,7 +31,6 @@ from idm_env.discovery.compare import ERRORS, Comparison, ErrorChange
 from idm_env.discovery.judgement import Judgement
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
-from idm_env.discovery.power import Strength
 from idm_env.discovery.records import gather
 from idm_env.discovery.selection import Round
 from idm_env.discovery.shared import Shared
@@ -95,22 +93,6 @@ def test_a_law_is_better_where_an_error_is_lower_beyond_chance() -> None:
     told = words.law_first(gipps, "IDM")
     assert told.startswith("Gipps' model predicts better than IDM calibrated alike: gap 5 s ahead −10.0")
     assert "explain --base gipps" in told
-
-
-def test_the_sentence_says_which_use_another_law_is_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beyond chance against the model that is chosen, and not by a trifle: that law was chosen among several."""
-    base = base_named("gipps")
-    of = errors(WORSE, replace(BETTER, ratio=0.7), SAME)
-    # Errors of laws are labels here, and how they compare is made up.
-    law = Law(base, Hypothesis((), Catalogue((), base, located=False)), "soon", of)  # type: ignore[arg-type]
-    found: dict[str, dict[str, Comparison]] = {"soon": of, "near": errors(SAME, replace(BETTER, ratio=0.98), SAME)}
-    monkeypatch.setattr(bases, "compare", lambda chosen, errors, seed: found[errors])
-    laws = [law._replace(against={}), law, law._replace(errors="near")]  # type: ignore[arg-type]
-    told = words.by_use(bases.uses(laws, "chosen", 0), "IDM")  # type: ignore[arg-type]
-    assert told.startswith("For the gap 5 s ahead Gipps' model is better than IDM: −30.0")
-    assert told.endswith("; it errs more in the gap in free simulation.") and told.count("Gipps") == 1
-    for others, chosen in ((laws[2:], "chosen"), (laws[:2], "soon"), ([law._replace(at_best=True)], "chosen")):
-        assert bases.uses(others, chosen, 0) == []  # type: ignore[arg-type]
 
 
 def test_a_choice_is_made_anew_without_every_fold() -> None:
@@ -316,33 +298,6 @@ def test_whoever_gave_seven_runs_is_not_told_that_seven_are_needed() -> None:
     weak = words.headline(Verdict.CANNOT_TELL, [], Refusal(Reason.NO_POWER, 5), "", {})
     assert "the 5 runs left for model selection would not have shown most effects" in weak
     assert "more runs, ten or more, are needed" in weak
-
-
-def test_none_says_what_is_excluded_and_what_would_not_have_been_seen() -> None:
-    """Beside the sentence, which claims no bounds."""
-    lag, drag = (ALL[n]().parameters[0] for n in ("lag", "drag"))
-    strengths = {
-        "drag": Strength(drag, 1e-5, -2e-4, 2.2e-4, 3e-4, 4e-4),
-        "lag": Strength(lag, 0.01, -0.08, 0.12, 0.2, 0.5),
-    }
-    assert "beyond" not in words.headline(Verdict.NONE, [], Refusal(Reason.NO_GAIN), "", {})
-    excluded, missed = words.excluded(Verdict.NONE, strengths)
-    assert "response lag beyond −0.08 … 0.12 s" in excluded and "drag below 0.0003 1/m" in missed
-    strengths["drag"] = replace(strengths["drag"], seen=float("inf"))
-    assert "drag of whatever strength; response lag below 0.2 s" in words.excluded(Verdict.NONE, strengths)[1]
-
-
-def test_nothing_is_excluded_by_an_interval_that_power_contradicts() -> None:
-    """A few windows near standstill made "no bias beyond 0.0026 m" of data in which 4.9 m would not have been seen."""
-    bias, lag = (ALL[n]().parameters[0] for n in ("gap_bias", "lag"))
-    strengths = {
-        "gap_bias": Strength(bias, 0.0, -0.0026, 0.0026, 4.9, 1.0),
-        "lag": Strength(lag, 0.01, -0.08, 0.12, 0.2, 0.5),
-    }
-    excluded, missed = words.excluded(Verdict.NONE, strengths)
-    assert "lag" in excluded and "bias" not in excluded and "below 4.9 m" in missed
-    del strengths["lag"]
-    assert len(words.excluded(Verdict.NONE, strengths)) == 1
 
 
 def test_ceilings_are_told_with_the_smooth_function_and_the_sensors(lag: Discovery) -> None:
