@@ -185,9 +185,7 @@ def check_runs(nowhere: pl.DataFrame, source: str) -> None:
     """Raise DataError if there are rows of vehicles without a run."""
     if nowhere.height:
         vehicle = nowhere["vehicle_id"][0]
-        raise DataError(
-            f"{source}: run_id is empty for vehicle {vehicle}; name the run of every row, or remove the column."
-        )
+        raise DataError(f"{source}: run_id is empty for vehicle {vehicle}; name the run of each row, or none.")
 
 
 @dataclass

@@ -131,9 +131,7 @@ def _spans(
 def _place(trajectories: Trajectories, values: np.ndarray, run: str) -> np.ndarray:
     filled = columns.filled(values)
     if filled is None:
-        raise DataError(
-            f"{trajectories.source}: place column {trajectories.place!r} is empty in run {run}; name another."
-        )
+        raise DataError(f"{trajectories.source}: column {trajectories.place!r} is empty in run {run}; name another.")
     return filled
 
 

@@ -207,9 +207,7 @@ def _profile(prepared: Records, column: str) -> tuple[float, float, list[float]]
     # Where a record does not tell, the profile of the others is taken for the same place.
     recorded = [e for e in prepared.episodes if column in e.columns]
     if not recorded:
-        raise ValueError(
-            f"a profile over places needs the column {column} without holes, and no record has it. Fill it in."
-        )
+        raise ValueError(f"a profile over places needs the column {column} without holes, and none has it. Fill it in.")
     place = np.concatenate([e.place_m for e in recorded])
     value = np.concatenate([e.columns[column] for e in recorded])
     period = prepared.period
