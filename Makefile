@@ -25,7 +25,7 @@ demo: $(VENV)/.data
 	$(BIN)/idm-env demo $(if $(DATA),--data '$(DATA)') --out '$(OUT)'
 
 test: setup
-	$(BIN)/python -m pytest -n 2 $(PYTEST)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST)
 
 # What meets Gymnasium's own code, on the version that RLlib pins: that one alone, before the one of .venv.
 GYMNASIUM := build/gymnasium-1.2.2

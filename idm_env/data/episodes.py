@@ -100,14 +100,17 @@ def _valid(
             ("leader not measured", around.leader < 0, "whose leader is not measured at that time"),
             ("no gap", np.isnan(gap), "without a gap"),
             ("gap not positive", gap <= 0, "with a gap of 0 m or less"),
-            ("leader lost", gap > highest, f"with a gap above {highest:g} m, taken as a lost leader,"),
+            (f"gap above {highest:g} m", gap > highest, f"with a gap above {highest:g} m, taken as a lost leader,"),
         ]
     for kind, wrong, words in rules:
         out = valid & wrong
         if out.any():
             vehicles = table.filter(pl.Series(out)).select("run_id", "vehicle_id").n_unique()
             text = f"{out.sum()} rows of {vehicles} drivers {words} were left out."
-            repairs.append(Repair(kind, int(out.sum()), text))
+            most = (
+                "most rows (is --max-gap too small?), " if wrong is rules[-1][1] and out.sum() > valid.sum() / 2 else ""
+            )
+            repairs.append(Repair(most + kind, int(out.sum()), text))
             valid &= ~wrong
     return valid, repairs
 

@@ -16,6 +16,7 @@ from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.model_file import Model, load_environment, load_model, save_model
 from idm_env.tasks import TASKS, make_task
 
+pytestmark = pytest.mark.usefixtures("torch_path")
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 GOOD = {"configures": "model", "effects": ["idm", "brakes"], "parameters": {"idm": {"time_gap": 1.1}}}
 
