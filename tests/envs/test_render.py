@@ -220,6 +220,7 @@ def test_a_crash_is_marked_where_it_happens(task):
     assert marked(state) == 0 and 100 < marked(state._replace(gap=gap)) < 600
 
 
+@pytest.mark.usefixtures("torch_path")
 def test_a_signal_and_a_closed_lane_are_drawn_while_they_hold():
     """The line is red for 30 s of 60 and green for as long; a stretch is closed from 2 to 4 s."""
     env = gym.make("DiffIDM-v0", task="approach", render_mode="rgb_array")
