@@ -166,8 +166,7 @@ def _of_date(text: pl.Series, source: str) -> pl.Series:
             "write all times with it, or none."
         )
     number = zone.str.replace(":", "").str.replace("(?i)Z", "+0000").str.pad_end(5, "0").cast(pl.Int64, strict=False)
-    minutes = number.abs() // 100 * 60 + number.abs() % 100
-    return seconds - 60.0 * minutes * number.sign()
+    return seconds - 60.0 * (number.abs() // 100 * 60 + number.abs() % 100) * number.sign()
 
 
 def without_empty(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:

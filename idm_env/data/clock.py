@@ -111,8 +111,7 @@ def _grid(exact: np.ndarray, track: np.ndarray, bridge: np.ndarray) -> tuple[np.
     following = np.append(first[1:], 0.0)
     count = np.where(joined, following - first, first == exact).astype(int)
     left = np.repeat(np.arange(len(exact)), count)
-    within = np.arange(len(left)) - np.repeat(np.cumsum(count) - count, count)
-    ticks = first[left] + within
+    ticks = first[left] + (np.arange(len(left)) - np.repeat(np.cumsum(count) - count, count))
     span = np.where(joined, np.append(np.diff(exact), 1.0), 1.0)
     return left, (ticks - exact[left]) / span[left], ticks
 

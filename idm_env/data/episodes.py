@@ -39,8 +39,7 @@ def episodes(
     """
     table = columns.with_step(trajectories)
     around = find(table)
-    gap = table["gap_m"].to_numpy()
-    valid, left_out = _valid(trajectories, table, around, gap, max_gap)
+    valid, left_out = _valid(trajectories, table, around, table["gap_m"].to_numpy(), max_gap)
     stretches, changes, too_short = _spans(trajectories, table, valid, min_seconds)
     if changes:
         text = f"The leader changes at {changes} rows; the stretch was split there."

@@ -83,8 +83,7 @@ def _scenario(content: dict[str, Any], source: str) -> Scenario:
         elif road.get("type") == "stop_sign" and len(line):
             controls.append(TrafficControl("sign", line[0]))
     controls += _signals(content.get("tl_states"))
-    metadata = content.get("metadata") or {}
-    chosen = metadata.get("tracks_to_predict")
+    chosen = (content.get("metadata") or {}).get("tracks_to_predict")
     if chosen is None:
         targets = tuple(i for i, agent in enumerate(agents) if agent.valid[PRESENT])
         notes.append("the file names no tracks_to_predict: every agent valid at the present step is predicted")

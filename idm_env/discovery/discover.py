@@ -183,8 +183,7 @@ def _split(prepared: Records, share: float, seed: int) -> tuple[list[str], list[
     if len(runs) < 2:
         return runs, []
     count = min(max(1, round(share * len(runs))), len(runs) - 1)
-    order = np.random.default_rng(seed).permutation(len(runs))
-    test = {runs[i] for i in order[:count]}
+    test = {runs[i] for i in np.random.default_rng(seed).permutation(len(runs))[:count]}
     return [r for r in runs if r not in test], [r for r in runs if r in test]
 
 
