@@ -122,7 +122,8 @@ def _residual(d: Discovery) -> list[np.ndarray]:
     shown = []
     for s in (d.null, d.final)[: len(d.judgement.titles)]:
         errors = problem.errors(s.theta[None], s.model, s.values[None])[0]
-        shown.append(-np.diff(errors[:, 1:-2:2], axis=1, prepend=0.0))
+        seconds = errors[:, 1:-2:2]
+        shown.append(-np.diff(seconds, axis=1, prepend=0.0))
     return shown
 
 
@@ -146,32 +147,6 @@ def features(d: Discovery) -> Figure:
             axis.set_xlabel(words.ALONG[name] + ("" if unit == "1" else f" ({unit})"))
     figure.legend(handles=axes[0, 0].get_legend_handles_labels()[0], loc="outside upper left", ncols=2)
     figure.supylabel("residual (m/s²)", fontsize=9)
-    return figure
-
-
-def maps(d: Discovery) -> Figure:
-    """Residual over position and time."""
-    titles = d.judgement.titles
-    figure, grid_of = plt.subplots(
-        1, len(titles), layout="constrained", figsize=(9.0, 3.2), sharey=True, sharex=True, squeeze=False
-    )
-    axes = grid_of[0]
-    grids, extent = [], (0.0, 1.0, 0.0, 1.0)
-    for residual in _residual(d):
-        responses = d.responses
-        x, t = responses.coordinates["position"].ravel(), responses.coordinates["time"].ravel()
-        bins = [np.linspace(x.min(), x.max() + 1e-6, 40), np.linspace(t.min(), t.max() + 1e-6, 30)]
-        total = np.histogram2d(x, t, bins, weights=residual.ravel())[0]
-        count = np.histogram2d(x, t, bins)[0]
-        grids.append(np.where(count > 0, total / np.maximum(count, 1), np.nan).T)
-        extent = (bins[0][0], bins[0][-1], bins[1][0], bins[1][-1])
-    limit = float(np.nanquantile(np.abs(grids[0]), 0.95)) or 1.0
-    for axis, grid, title in zip(axes, grids, titles, strict=True):
-        image = axis.imshow(grid, origin="lower", aspect="auto", extent=extent, cmap="RdBu_r", vmin=-limit, vmax=limit)
-        axis.set_title(title)
-        axis.set_xlabel("position (m)")
-    axes[0].set_ylabel("time (s)")
-    figure.colorbar(image, ax=axes, shrink=0.8, label="m/s²")
     return figure
 
 

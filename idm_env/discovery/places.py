@@ -38,19 +38,23 @@ class Responses:
     coordinates: dict[str, np.ndarray]
     square: np.ndarray
 
-    def design(self, what: str, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return per unit the matrix [units, B, B] and vector [units, B] of a basis [R, J, B] over the coordinates.
+    def answer(self, what: str, basis: np.ndarray) -> np.ndarray:
+        """Return the response [R, m, B] to a basis [R, J, B] over the coordinates.
 
-        Both are projected off what re-calibrated drivers would absorb.
+        It is projected off what re-calibrated drivers would absorb.
         """
         rows = self.rows
         response = np.einsum("jrm,rjb->rmb", self.change[WHATS.index(what)], basis)
-        groups, count = len(rows.records.groups), basis.shape[-1]
-        cross = np.zeros((groups, self.by_theta.shape[-1], count))
+        cross = np.zeros((len(rows.records.groups), self.by_theta.shape[-1], basis.shape[-1]))
         np.add.at(cross, rows.group, np.einsum("rmi,rmb->rib", self.by_theta, response))
         follow = np.einsum("gij,gjb->gib", self.absorbed, cross)
         response -= np.einsum("rmi,rib->rmb", self.by_theta, follow[rows.group])
-        unit_of_row = self.units.of_record[rows.record]
+        return response
+
+    def design(self, what: str, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return per unit the matrix [units, B, B] and vector [units, B] of ``answer``."""
+        response, count = self.answer(what, basis), basis.shape[-1]
+        unit_of_row = self.units.of_record[self.rows.record]
         matrix, vector = np.zeros((len(self.units), count, count)), np.zeros((len(self.units), count))
         for unit in range(len(self.units)):
             mine = response[unit_of_row == unit].reshape(-1, count)
@@ -215,16 +219,22 @@ def _best(matrix: np.ndarray, vector: np.ndarray, allowed: np.ndarray) -> tuple[
     return int(best[0]), int(best[1]), float(push[best] / weight[best]), float(gain[best])
 
 
-def linear_curve(responses: Responses, what: str, basis: np.ndarray, spread: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients [B] of a basis [R, J, B] and honest gains per unit, with a prior of width spread."""
+def linear_curve(
+    responses: Responses, what: str, basis: np.ndarray, spread: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the coefficients [B] of a basis [R, J, B], with a prior of width spread, and honest gains per unit.
+
+    The last are the coefficients [units, B] without the runs of each unit.
+    """
     matrix, vector = responses.design(what, basis)
     ridge = np.eye(vector.shape[1]) / spread**2
-    gains = np.zeros(len(vector))
+    gains, without = np.zeros(len(vector)), np.zeros_like(vector)
     for mine in _by_run(responses):
         c = np.linalg.solve(matrix.sum(0) - matrix[mine].sum(0) + ridge, vector.sum(0) - vector[mine].sum(0))
+        without[mine] = c
         for unit in mine:
             gains[unit] = log_gain(float(2 * c @ vector[unit] - c @ matrix[unit] @ c), responses.square[unit])
-    return np.linalg.solve(matrix.sum(0) + ridge, vector.sum(0)), gains
+    return np.linalg.solve(matrix.sum(0) + ridge, vector.sum(0)), gains, without
 
 
 def hats(values: np.ndarray, first: float, distance: float, count: int, period: float = 0.0) -> np.ndarray:

@@ -197,7 +197,8 @@ class Search:
                     best = solve(self.problem, model, best.theta, best.values, iterations=iterations)
             arrays = {"theta": torch.from_numpy(best.theta), "values": torch.from_numpy(best.values)}
             self.saved.put(key, {**arrays, "cost": float(best.cost)})
-        return Scored(term, best, log_gain(before, held_out(self.problem, best)))
+        gains = log_gain(before, held_out(self.problem, best))
+        return Scored(term, best, gains)
 
     def _promise(
         self, solution: Solution, term: Term, begin: Sequence[np.ndarray] | None = None
@@ -335,7 +336,7 @@ def _line(responses: places.Responses, term: Term) -> tuple[np.ndarray, np.ndarr
     if term.by:
         basis = basis * np.clip(responses.coordinates[term.by] / PER[term.by], -2.0, 2.0)[..., None]
     spread = term.smoothness if term.made is None else terms.SPREAD
-    return places.linear_curve(responses, term.what, basis, spread)
+    return places.linear_curve(responses, term.what, basis, spread)[:2]
 
 
 def _interval_term(

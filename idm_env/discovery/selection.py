@@ -11,6 +11,7 @@ from scipy.stats import ttest_1samp
 from idm_env.discovery import closed_loop, judge, places, together
 from idm_env.discovery.march import CURVE
 from idm_env.discovery.model import Hypothesis, Term
+from idm_env.discovery.power import PROMISING
 from idm_env.discovery.records import whole
 from idm_env.discovery.score import (
     ALPHA,
@@ -36,6 +37,8 @@ FEWEST_RUNS = 3
 MOST_ROUNDS = 3
 SAME = 0.15
 """Candidates whose gain is within this share of the best one's are told apart by nothing but their names."""
+SHOWN = 0.1
+"""Share of the largest gain of a unit from which on another one shows the effect, too."""
 SPANS = 5
 """Knots from which on a curve has in it what an interval would say; a ramp has not."""
 AT_FLOOR = 1.15
@@ -130,7 +133,8 @@ def decide(searching: Search, null: Solution, seed: int) -> Decided:
             steps.append(searching.null(chosen.model, chosen.theta, chosen.values))
     if steps:
         steps[-1] = searching.weighed(_delete(searching, steps[-1], len(null.model.terms)))[1]
-    return Decided(null, steps, rounds, _joined(searching, null, steps, rounds, seed), fit)
+    joined = _joined(searching, null, steps, rounds, seed)
+    return Decided(null, steps, rounds, joined, fit)
 
 
 def _joined(
@@ -293,10 +297,9 @@ def _choose(searching: Search, now: Solution, this: Round) -> None:
         this.refusal = Refusal(Reason.FEW_RUNS, figure=runs)
         return
     tested, scored = this.tested, this.scored
-    able = [
-        i for i, s in enumerate(scored)
-        if s.solution is not None and tested.p_value[i] < ALPHA and tested.gain[i] >= LEAST_GAIN
-    ]  # fmt: skip
+    fitted = [i for i, s in enumerate(scored) if s.solution is not None]
+    able = [i for i in fitted if tested.p_value[i] < ALPHA and tested.gain[i] >= LEAST_GAIN]
+    able = able or [i for i in fitted if scored[i].term.past and shows_in_few(scored[i].gains)]
     if not able:
         this.refusal = Refusal(Reason.NO_GAIN)
         return
@@ -328,6 +331,15 @@ def _choose(searching: Search, now: Solution, this: Round) -> None:
         return
     this.winner = winner
     this.equivalent = [i for i in same if i != winner]
+
+
+def shows_in_few(gains: np.ndarray) -> bool:
+    """Tell whether gains [units] are large, and of one sign wherever the effect can show.
+
+    A run without a stop says nothing of what follows one: its sign is chance, and few others can have no small p.
+    """
+    shown = gains[np.abs(gains) > SHOWN * np.abs(gains).max()]
+    return bool(gains.mean() >= PROMISING and len(shown) >= FEWEST_RUNS and (shown > 0.0).all())
 
 
 def _closed_loop_holds(searching: Search, now: Solution, chosen: Solution) -> bool:

@@ -8,13 +8,15 @@ no run is special.) What leaders' motion foretells by other runs is an answer to
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from scipy.stats import norm as normal
 
-from idm_env.discovery.places import Responses, scan
+from idm_env.discovery.model import SPREAD
+from idm_env.discovery.places import WHATS, Responses, hats, linear_curve, scan
 from idm_env.discovery.records import Rows
+from idm_env.effects.free import HISTORY
 
 TURNS = 199
 ALPHA = 0.002
@@ -27,6 +29,8 @@ LAG_S = 10.0
 """How long ago what a leader did may still be answered to."""
 RIDGES = (0.003, 0.03, 0.3)
 """Weights of the prior of coefficients of scaled features, in units of the number of windows."""
+KNOTS = 6
+"""Of curves over the past, from the 0.2nd to the 99.8th percentile."""
 USUAL = 1.0
 """Score of the other runs, in the median and in units of chance, above which all miss the model and none is special."""
 
@@ -51,9 +55,10 @@ def find(responses: Responses, seed: int) -> Shared | None:
     vehicles behind each other are unsteady at the same times (all move, or all stand), no less than the root of the
     sum of these products squared; p of a normal score, times the number of runs. The interval is the one of time in
     which an added acceleration explains most of that run, drivers re-calibrated. Residuals are those ``beyond`` what
-    the leaders' motion foretells.
+    the leaders' motion foretells, and the past by ``past_out``: followers of one leader have one past.
     """
-    responses = replace(responses, residual=beyond(responses.residual, leaders(responses.rows), responses.rows.run))
+    left = beyond(past_out(responses), leaders(responses.rows), responses.rows.run)
+    responses = replace(responses, residual=left)
     rows, records = responses.rows, responses.rows.records
     number = np.round(records.column("time")[rows.start] / (rows.steps * records.dt)).astype(int)
     random = np.random.default_rng(seed)
@@ -78,6 +83,23 @@ def find(responses: Responses, seed: int) -> Shared | None:
     if stretch is None:
         return None
     return Shared(records.runs[run], stretch.begin, stretch.end, stretch.amount, int(vehicles[run]), p_value)
+
+
+def past_out(responses: Responses) -> np.ndarray:
+    """Return residuals [R, m] less what the best curve over a feature of the past foresees, fitted to the other runs.
+
+    Where no curve gains, these stand.
+    """
+    left, most = responses.residual, 0.0
+    for what, feature in product(WHATS, HISTORY):
+        values = responses.coordinates[feature]
+        low, high = np.quantile(values, (0.002, 0.998))
+        basis = hats(values, low, max(high - low, 1e-6) / (KNOTS - 1), KNOTS)
+        _, gains, without = linear_curve(responses, what, basis, SPREAD)
+        if gains.mean() > most:
+            of_row, most = responses.units.of_record[responses.rows.record], float(gains.mean())
+            left = responses.residual + np.einsum("rmb,rb->rm", responses.answer(what, basis), without[of_row])
+    return left
 
 
 def leaders(rows: Rows) -> np.ndarray:

@@ -13,7 +13,7 @@ from idm_env.discovery.fleet import Kinds
 from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.model import Term
 from idm_env.discovery.result import Ceilings, TermFinding, Weight
-from idm_env.discovery.score import Contrast
+from idm_env.discovery.score import ALPHA, Contrast
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution
 from idm_env.discovery.tails import WORST
@@ -283,6 +283,8 @@ def details(verdict: Verdict, found: Sequence[TermFinding], nearest: Sequence[Te
             f"{f.title[0].upper()}{f.title[1:]}: p = {number(f.p_value, 2)} over the whole list of candidates; first "
             f"of it in {f.chosen_in_folds:.0%} of choices without a fold of the runs."
         )
+        if f.p_value >= ALPHA:
+            parts.append("Few runs can show it, and all of these gain by it.")
         if f.equivalent:
             parts.append(f"These data cannot tell it from {', '.join(plain(x) for x in f.equivalent)}.")
         rivals = [plain(x) for x in f.rivals if x not in f.equivalent]
@@ -302,7 +304,7 @@ def details(verdict: Verdict, found: Sequence[TermFinding], nearest: Sequence[Te
     if nearest:
         parts.append(f"Nearest came, without being added: {', and '.join(f.clause for f in nearest)}.")
     if verdict is Verdict.UNEXPLAINED:
-        parts.append("The ranking and the maps of the residual below say where to look.")
+        parts.append("The ranking and the residual against features below say where to look.")
     return parts
 
 

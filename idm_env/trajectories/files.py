@@ -179,7 +179,8 @@ def _strand(strand: _Strand, progress: OnProgress) -> None:
     parts, settings, borders = strand.parts, strand.settings, strand.shelf.borders
     recent: list[Filtered] = []
     for number in strand.numbers:
-        pieces = Pieces(strand.shelf.table(number), strand.bridge)
+        table = strand.shelf.table(number)
+        pieces = Pieces(table, strand.bridge)
         tracks = list(pieces)
         recent = [f for f in recent if tracks and _reaches(f, tracks)]
         begin, end = borders[number], borders[number + 1]

@@ -1,10 +1,17 @@
 """What vehicles of one run share: chance is as often beyond a level as the level says."""
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from idm_env.discovery.shared import beyond, standing_out
+from idm_env.discovery.places import WHATS, Responses
+from idm_env.discovery.records import Rows
+from idm_env.discovery.shared import beyond, past_out, standing_out
+from idm_env.discovery.units import Units
+from idm_env.effects.free import HISTORY
 
 
 def _runs(number: int, unsteady: float) -> list[np.ndarray]:
@@ -44,3 +51,27 @@ def test_what_all_answer_to_in_the_leader_is_no_cause_of_a_run(of_leader: bool) 
     left = beyond(residual.reshape(-1, 12), features, np.repeat(np.arange(runs), 3 * count)).reshape(residual.shape)
     before, after = (standing_out(table[3], np.random.default_rng(0)) for table in (residual, left))
     assert before > 3.0 and (after < 3.0 if of_leader else after > 3.0)
+
+
+@pytest.mark.parametrize("of_past", [True, False])
+def test_what_followers_do_of_one_past_is_no_cause_of_a_run(of_past: bool) -> None:
+    """A time gap that is longer after a stop shows most in run 3, which stopped: three of three were "located"."""
+    random, runs, count = np.random.default_rng(2), 10, 33
+    run = np.repeat(np.arange(runs), 3 * count)
+    since = np.where(np.isin(run, (1, 3, 6)), np.tile(np.arange(count) * 5.0, 3 * runs) % 90.0, 90.0)[:, None]
+    change = random.standard_normal((len(WHATS), 1, len(run), 12))
+    # Followers of one run have one leader, whose motion makes their responses alike.
+    change = np.repeat(change.reshape(len(WHATS), 1, runs, 3, count, 12)[:, :, :, :1], 3, axis=3).reshape(change.shape)
+    strength = (
+        np.exp(-since / 30.0) if of_past else ((run == 3)[:, None] & (np.tile(np.arange(count), 30) < 8)[:, None])
+    )
+    residual = 3.0 * change[WHATS.index("time_gap"), 0] * strength + random.standard_normal((len(run), 12))
+    coordinates = dict.fromkeys(HISTORY, random.random(since.shape)) | {"time_since_stop": since}
+    records = SimpleNamespace(groups=[0])
+    rows = cast(Rows, SimpleNamespace(run=run, record=run, group=0 * run, records=records))
+    counted, square = Units(np.arange(runs), np.arange(runs)), np.bincount(run, (residual**2).sum(1))
+    nothing = np.zeros((len(run), 12, 1))
+    part = Responses(rows, counted, change, residual, nothing, np.ones((1, 1, 1)), coordinates, square)
+    left = past_out(part)
+    before, after = (standing_out(x.reshape(runs, 3, count, 12)[3], np.random.default_rng(0)) for x in (residual, left))
+    assert before > 3.0 and (after < 3.0 if of_past else after > 3.0), (before, after)

@@ -32,7 +32,7 @@ from idm_env.discovery.judgement import Judgement
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import gather
-from idm_env.discovery.selection import Round
+from idm_env.discovery.selection import Round, shows_in_few
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves
 from idm_env.effects import ALL, CANDIDATES, base_named
@@ -339,3 +339,11 @@ def test_a_latency_below_half_a_step_gets_no_name() -> None:
         s = SimpleNamespace(model=model, values=np.array([1e-4, seconds]))
         assert together.is_too_short(s, model.terms[1:], 0.1) is short  # type: ignore[arg-type]
         assert not together.is_too_short(s, model.terms[:1], 0.1)  # type: ignore[arg-type]
+
+
+def test_a_run_that_cannot_show_an_effect_has_no_say() -> None:
+    """Of six runs four had stops and gained 20 % each by what follows one: p = 0.2, as signs of four can have."""
+    assert shows_in_few(np.array([0.2, 0.25, 0.0, 0.15, -0.002, 0.2]))
+    assert not shows_in_few(np.array([0.2, 0.25, 0.0, -0.15, 0.0, 0.2]))  # one that shows it loses
+    assert not shows_in_few(np.array([0.2, 0.25, 0.0, 0.0, -0.002, 0.0]))  # two may be chance
+    assert not shows_in_few(np.array([0.02, 0.025, 0.0, 0.015, -0.002, 0.02]))  # sets with nothing in them come near
