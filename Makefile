@@ -6,7 +6,7 @@ DATA ?=
 OUT ?= out/demo
 PYTEST ?=
 
-.PHONY: setup demo test test-gymnasium test-lowest rllib lint bench docs clean
+.PHONY: setup demo test test-much test-little test-gymnasium test-lowest rllib lint bench docs clean
 
 setup: $(VENV)/.installed
 
@@ -18,22 +18,31 @@ $(VENV)/.data: pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/.installed: $(VENV)/.data
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,docs]'
 	touch $@
 
 demo: $(VENV)/.data
 	$(BIN)/idm-env demo $(if $(DATA),--data '$(DATA)') --out '$(OUT)'
 
-test: setup
-	$(BIN)/python -m pytest -n 2 $(PYTEST)
+# Most tests, of compiled code above all, run it as users do. Those that make many environments and step each of them a little
+# compile it unoptimised, which takes half the time. Each file on one worker, which compiles its programs once.
+FACES := $(addprefix tests/envs/test_,gym.py pettingzoo.py sb3.py render.py limits.py fitting_wrapper.py)
+LITTLE := tests/agents tests/tasks tests/envs/test_recording.py $(FACES) $(wildcard tests/test_*.py)
+TEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST)
+test: test-much test-little
+
+test-much: setup
+	$(TEST) $(addprefix --ignore=,$(LITTLE)) tests
+
+test-little: setup
+	NUMBA_OPT=0 $(TEST) $(LITTLE)
 
 # What meets Gymnasium's own code, on the version that RLlib pins: that one alone, before the one of .venv.
 GYMNASIUM := build/gymnasium-1.2.2
 test-gymnasium: setup
 	test -d $(GYMNASIUM)/gymnasium || \
 	  $(BIN)/python -m pip install --quiet --no-deps --target $(GYMNASIUM) gymnasium==1.2.2
-	PYTHONPATH=$(GYMNASIUM) $(BIN)/python -m pytest -n 2 $(addprefix tests/envs/test_,gym.py vector.py gradients.py \
-	  pettingzoo.py sb3.py render.py limits.py fitting_wrapper.py)
+	PYTHONPATH=$(GYMNASIUM) NUMBA_OPT=0 $(TEST) $(FACES) tests/envs/test_vector.py
 
 # What users touch, on the lowest versions that pyproject.toml allows (torch: that of constraints.txt), in an environment of
 # its own; without what takes further libraries from .venv.
@@ -63,7 +72,6 @@ bench: setup
 # The site, into build/site: warnings are errors, and no network is needed once the libraries are there. GALLERY=0 shows the
 # examples without running them, as continuous integration does, whose tests run them all.
 docs: setup
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	$(BIN)/python -m sphinx -W --keep-going -q -b html -d build/doctrees $(if $(filter 0,$(GALLERY)),-D plot_gallery=0) docs build/site
 	@echo "Site: build/site/index.html"
 

@@ -57,7 +57,7 @@ class _KeptCode:
         from numba.core.compiler import CompileResult
 
         context.refresh()
-        name = self._name(f"{signature} {context.codegen().magic_tuple()}")
+        name = self._name(f"{signature} {context.codegen().magic_tuple()}{_effort()}")
 
         def rebuilt(content: bytes) -> Any:
             calls, parts = pickle.loads(content)
@@ -72,13 +72,20 @@ class _KeptCode:
 
         if compiled.library.has_dynamic_globals or not all(loop.can_cache for loop in compiled.lifted):
             return
-        name = self._name(f"{signature} {compiled.codegen.magic_tuple()}")
+        name = self._name(f"{signature} {compiled.codegen.magic_tuple()}{_effort()}")
         links = {} if self._links is None else self._links.known
         symbols = [f.name for f in compiled.library._final_module.functions if f.is_declaration] if links else []
         self._store.save(name, dumps(([links[s] for s in symbols if s in links], compiled._reduce())))
 
     def flush(self) -> None:
         """Nothing: what is stale has another name."""
+
+
+def _effort() -> str:
+    """Return what names code that is optimised less or more than usual (``NUMBA_OPT``): it is no other's."""
+    from numba.core import config
+
+    return "" if repr(level := vars(config)["OPT"]) == "_OptLevel(3)" else f" {level!r}"
 
 
 def compiled_loop(
@@ -102,10 +109,8 @@ def address_of(loop: Any, kinds: tuple[Any, ...]) -> tuple[int, Any]:
     Why: numba gives addresses of callbacks only, whose types stand in the text. Tried: numba 0.60.0 and 0.68.1.
     """
     loop.compile(kinds)
-    overload = loop.overloads[kinds]
-    return overload.library.get_pointer_to_function(
-        overload.fndesc.llvm_cfunc_wrapper_name
-    ), overload.signature.return_type
+    code = loop.overloads[kinds]
+    return code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name), code.signature.return_type
 
 
 def compiled_callback(

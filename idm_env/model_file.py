@@ -124,9 +124,7 @@ def load_model(path: str | Path, *, trusted: bool = False) -> Model:
 def _model(content: dict[str, Any]) -> Model:
     _check_keys(content, ("configures", "schema", *(field.name for field in dataclasses.fields(Model))), "key")
     if content.get("configures", "model") != "model":
-        raise ValueError(
-            f"configures = {shown(content['configures'])}, and a model is wanted. Write 'configures: model'."
-        )
+        raise ValueError(f"configures = {shown(content['configures'])}, not a model. Write 'configures: model'.")
     if content.get("schema", SCHEMA) != SCHEMA:
         raise ValueError(f"schema = {shown(content['schema'])} is unknown; this version reads schema {SCHEMA}.")
     if not content.get("effects"):
@@ -186,9 +184,7 @@ def load_environment(path: str | Path, *, trusted: bool = False) -> dict[str, An
     with trust.trusting(trusted):
         content = read_yaml(path)
     if content.pop("configures", None) != "environment":
-        raise ValueError(
-            f"{path}: no environment is configured here. Write 'configures: environment' in its first line."
-        )
+        raise ValueError(f"{path}: no environment is configured here. Write 'configures: environment' first.")
     return {str(key): value for key, value in content.items()}
 
 

@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+# As many processes test as there are cores: a thread each, also in processes that tests begin. torch reads it once.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from idm_env.effects import ALL
 
 # Examples are as many as a suite of minutes allows, and take as long as the machine is busy; fixtures that they share
@@ -45,10 +48,32 @@ def measured() -> Callable[[str], Path]:
     return find
 
 
+LONG = ("test_discover", "test_bases", "test_wheel", "test_examples", "test_docs")
+"""Files that take a minute each: they are begun first, so that none of them is waited for in the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with long files; otherwise the order stays."""
+    items.sort(key=lambda item: item.path.stem not in LONG)
+
+
 def pytest_collection_finish() -> None:
-    """Keep what the imports made out of every later collection of garbage, which then takes milliseconds."""
+    """Keep what the imports made out of every later collection of garbage, which then takes milliseconds.
+
+    What a compiler makes is walked through less often: that took a tenth of its time. Each test collects at its end.
+    """
     gc.collect()
     gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
+
+
+@pytest.fixture
+def torch_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile no environment's step, in processes of the test either: for laws that many programs would hold once each.
+
+    Both paths are held equal by tests/kernels, tests/laws/test_printed.py and tests/envs/test_values.py.
+    """
+    monkeypatch.setenv("IDM_ENV_KERNELS", "0")
 
 
 @pytest.fixture(autouse=True)

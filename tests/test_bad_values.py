@@ -5,10 +5,12 @@ from __future__ import annotations
 import gzip
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -23,12 +25,15 @@ from agents import apg, common
 from agents.policy import Policy
 from idm_env import validation
 from idm_env.cli import commands as cli
-from idm_env.data import synthetic
+from idm_env.data import sizes, synthetic
+from idm_env.envs import window
+from idm_env.envs.batch import Batch
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.envs.settings import settings as settings_of
 from idm_env.model_file import load_environment, load_model
 from idm_env.tasks import KeywordError
 from tests.commands import refused, typed
+from tests.data.tables import platoon
 
 QUICK = settings(max_examples=60)
 
@@ -297,14 +302,47 @@ def test_without_its_compiler_steps_go_on_and_loops_say_so(data: Path) -> None:
     assert lines[-1] == "error: loops cannot be compiled while NUMBA_DISABLE_JIT is set. Unset it."
 
 
-def test_lack_of_memory_is_a_sentence(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def lacks(**_: object) -> None:
-        raise MemoryError
+LACKS = MemoryError(), RuntimeError("[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory")
+
+
+@pytest.mark.parametrize("error", LACKS, ids=lambda error: type(error).__name__)
+def test_lack_of_memory_is_a_sentence(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def lacks(*_: object, **__: object) -> None:
+        raise error
 
     monkeypatch.setattr(cli, "app", lacks)
     with pytest.raises(SystemExit):
         cli.run()
-    assert capsys.readouterr().err == "error: this needs more memory than there is\n"
+    cure = "Take fewer vehicles, runs or draws at a time, or free memory."
+    assert capsys.readouterr().err == f"error: this needs more memory than there is. {cure}\n"
+    env = gym.make_vec("DiffIDM-v0", num_envs=3, output="torch", warmup=0)
+    env.reset(seed=0)
+    monkeypatch.setattr(Batch, "_stepped", lacks)
+    monkeypatch.setattr(window, "compiled", lacks)
+    for act in (env.step, lambda _: env.unroll(torch.tanh, 2)):
+        with pytest.raises(MemoryError, match=r"^num_envs = 3 of \d+ vehicles need more memory than cpu has"):
+            act(None)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.csv.gz", "a.txt.gz", "a.zip", "a.parquet", "a.json.gz"])
+def test_a_file_that_no_memory_holds_is_refused_by_its_unpacked_size(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However small it is packed: six gigabytes of rows alike are fifty megabytes of gz."""
+    path, table = tmp_path / name, platoon(seconds=200.0)
+    text = table.write_csv().encode()
+    if name == "a.parquet":
+        table.write_parquet(path)
+    elif name == "a.zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+            file.writestr("a.csv", text)
+    else:
+        path.write_bytes(gzip.compress(text) if name.endswith(".gz") else text)
+    monkeypatch.setattr(sizes, "available", lambda: 16_000 * sizes.SHARE)
+    said = refused("predict" if "json" in name else "fit", path, "--out", tmp_path / "out")
+    assert re.search(rf"{name} holds .*GB or more, unpacked, and free memory .* at most 1.6e-05 GB", said)
 
 
 def test_a_packed_file_without_a_line_is_refused_by_its_size(tmp_path: Path) -> None:

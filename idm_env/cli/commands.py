@@ -458,9 +458,7 @@ def explain(
 def _names(option: str, text: str | None) -> tuple[str, ...] | None:
     names = None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
     if names == ():
-        raise ValueError(
-            f"{option} = {validation.shown(text)} names nothing. Give names by comma, or leave {option} out."
-        )
+        raise ValueError(f"{option} = {validation.shown(text)} names nothing. Give names, or leave {option} out.")
     return names
 
 
@@ -618,9 +616,7 @@ def bench(
         verbose: Say which path ran, and why.
     """
     if not (CHECKOUT / "benchmarks" / "bench").is_dir():
-        raise ValueError(
-            f"{CHECKOUT} has no benchmarks/: bench needs a checkout. Clone the project, then 'make bench'."
-        )
+        raise ValueError(f"{CHECKOUT} has no benchmarks/: bench needs a checkout. Clone it, then 'make bench'.")
     numbers = [round(_number("--sizes", size, "no number of vehicles")) for size in sizes.split(",")]
     with shown(console) as report:
         sys.path.insert(0, str(CHECKOUT))
@@ -657,7 +653,8 @@ def run() -> None:
         cause = error.__cause__ if isinstance(error, typer.Abort) else error
         if _stopped or not isinstance(cause, Exception):
             _interrupted()
-        if isinstance(cause, (ValueError, ImportError, OSError, EOFError, MemoryError)) or storage.full(cause):
+        clear = isinstance(cause, (ValueError, ImportError, OSError, EOFError))
+        if clear or storage.lacks_memory(cause) or storage.full(cause):
             _failed(cause)
         if not hasattr(error, "show"):
             raise
@@ -679,8 +676,9 @@ def run() -> None:
 
 def _failed(error: Exception) -> NoReturn:
     """End with one line that says what is wrong, never longer than a terminal can take."""
-    short = "this needs more memory than there is" if isinstance(error, MemoryError) else type(error).__name__
-    reason = storage.full(error) or str(error) or short
+    reason = storage.full(error) or str(error) or type(error).__name__
+    if storage.lacks_memory(error):
+        reason = "this needs more memory than there is. Take fewer vehicles, runs or draws at a time, or free memory."
     text = " ".join(" ".join([reason, *getattr(error, "__notes__", ())]).split())
     print(f"error: {text if len(text) <= 1000 else text[:1000] + ' …'}", file=sys.stderr)
     sys.exit(1)

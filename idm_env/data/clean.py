@@ -166,8 +166,7 @@ def _of_date(text: pl.Series, source: str) -> pl.Series:
             "write all times with it, or none."
         )
     number = zone.str.replace(":", "").str.replace("(?i)Z", "+0000").str.pad_end(5, "0").cast(pl.Int64, strict=False)
-    minutes = number.abs() // 100 * 60 + number.abs() % 100
-    return seconds - 60.0 * minutes * number.sign()
+    return seconds - 60.0 * (number.abs() // 100 * 60 + number.abs() % 100) * number.sign()
 
 
 def without_empty(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
@@ -185,9 +184,7 @@ def check_runs(nowhere: pl.DataFrame, source: str) -> None:
     """Raise DataError if there are rows of vehicles without a run."""
     if nowhere.height:
         vehicle = nowhere["vehicle_id"][0]
-        raise DataError(
-            f"{source}: run_id is empty for vehicle {vehicle}; name the run of every row, or remove the column."
-        )
+        raise DataError(f"{source}: run_id is empty for vehicle {vehicle}; name the run of each row, or none.")
 
 
 @dataclass

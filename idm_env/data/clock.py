@@ -19,6 +19,8 @@ CLOCK_ROUNDING_S = 1e-3
 """Times this close to the clock are on it: files round to milliseconds."""
 SHORTEST_STEP_S = 1e-3
 """No traffic is measured more often than 1000 times a second (s)."""
+UNSEEN_S = 10.0
+"""A vehicle that is not measured for so long is still on the road, and in front of those behind it (s)."""
 LINEAR = ("position_m", "speed_mps", "gap_m", "length_m")
 
 
@@ -85,6 +87,22 @@ def regularise(
     return result, _repairs(track, on_clock, track[left[changed]])
 
 
+def unseen(frame: pl.DataFrame, steps: dict[str, float]) -> tuple[pl.DataFrame, list[Repair]]:
+    """Return rows for the holes up to ``UNSEEN_S`` of tracks: about where, and in which lane, these vehicles are.
+
+    ``frame`` is what ``regularise`` returns. Who drives behind such a vehicle follows nobody else meanwhile.
+    """
+    position, step = pl.col("position_m"), pl.col("step")
+    hole = (step.shift(-1) - step).over(TRACK).alias("hole")
+    slope = ((position.shift(-1) - position).over(TRACK) / hole).alias("slope")
+    holes = frame.with_columns(hole, slope).filter((pl.col("hole") > 1) & (pl.col("hole") * of_run(steps) <= UNSEEN_S))
+    rows = holes.with_columns(pl.int_ranges(1, "hole").alias("beyond")).explode("beyond")
+    rows = rows.with_columns(position + pl.col("beyond") * pl.col("slope"), step + pl.col("beyond"))
+    keep = [name for name in (*TRACK, "step", "position_m", "lane", "ring_length_m") if name in frame.columns]
+    words = f"holes of at most {UNSEEN_S:g} s in tracks: vehicles behind them have no gap there."
+    return rows.select(keep), repaired("hole", holes.height, words)
+
+
 def _grid(exact: np.ndarray, track: np.ndarray, bridge: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return, per tick of the clock, the sample to its left, the weight of the one to its right, and the tick."""
     first = np.ceil(exact)
@@ -93,8 +111,7 @@ def _grid(exact: np.ndarray, track: np.ndarray, bridge: np.ndarray) -> tuple[np.
     following = np.append(first[1:], 0.0)
     count = np.where(joined, following - first, first == exact).astype(int)
     left = np.repeat(np.arange(len(exact)), count)
-    within = np.arange(len(left)) - np.repeat(np.cumsum(count) - count, count)
-    ticks = first[left] + within
+    ticks = first[left] + (np.arange(len(left)) - np.repeat(np.cumsum(count) - count, count))
     span = np.where(joined, np.append(np.diff(exact), 1.0), 1.0)
     return left, (ticks - exact[left]) / span[left], ticks
 

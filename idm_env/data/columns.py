@@ -24,8 +24,7 @@ def extra(table: pl.DataFrame) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return the further numeric columns as arrays (NaN where empty), and the names of those that can be labels."""
     others = [name for name in table.columns if name not in _KNOWN]
     numbers = {name: table[name].cast(pl.Float64).to_numpy() for name in others if table[name].dtype.is_numeric()}
-    texts = [name for name in others if not table[name].dtype.is_float()]
-    return numbers, [*texts, "lane"]
+    return numbers, [*(name for name in others if not table[name].dtype.is_float()), "lane"]
 
 
 def of_span(numbers: dict[str, np.ndarray], span: slice) -> dict[str, np.ndarray]:

@@ -26,6 +26,7 @@ import polars as pl
 from idm_env.data import clock
 from idm_env.data.errors import DataError, Repair, missing_column, repaired
 from idm_env.data.schema import TRACK
+from idm_env.data.sizes import refuse_size
 
 FRAME_S = 0.04
 FOOT_M = 0.3048
@@ -97,6 +98,7 @@ def pneuma(path: Path) -> Read:
     DataError where no line holds a track.
     """
     parts, broken = [], 0
+    refuse_size(path.stat().st_size, path.name)
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines()[1:]:
         cells = [cell.strip() for cell in line.strip().rstrip(";").split(";")]
         try:
@@ -138,6 +140,7 @@ def i24(path: Path) -> Read:
 
     DataError for what is no JSON, and where no document holds a track.
     """
+    refuse_size(path.stat().st_size, path.name)
     try:
         documents = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:

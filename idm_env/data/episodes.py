@@ -39,8 +39,7 @@ def episodes(
     """
     table = columns.with_step(trajectories)
     around = find(table)
-    gap = table["gap_m"].to_numpy()
-    valid, left_out = _valid(trajectories, table, around, gap, max_gap)
+    valid, left_out = _valid(trajectories, table, around, table["gap_m"].to_numpy(), max_gap)
     stretches, changes, too_short = _spans(trajectories, table, valid, min_seconds)
     if changes:
         text = f"The leader changes at {changes} rows; the stretch was split there."
@@ -100,14 +99,17 @@ def _valid(
             ("leader not measured", around.leader < 0, "whose leader is not measured at that time"),
             ("no gap", np.isnan(gap), "without a gap"),
             ("gap not positive", gap <= 0, "with a gap of 0 m or less"),
-            ("leader lost", gap > highest, f"with a gap above {highest:g} m, taken as a lost leader,"),
+            (f"gap above {highest:g} m", gap > highest, f"with a gap above {highest:g} m, taken as a lost leader,"),
         ]
     for kind, wrong, words in rules:
         out = valid & wrong
         if out.any():
             vehicles = table.filter(pl.Series(out)).select("run_id", "vehicle_id").n_unique()
             text = f"{out.sum()} rows of {vehicles} drivers {words} were left out."
-            repairs.append(Repair(kind, int(out.sum()), text))
+            most = (
+                "most rows (is --max-gap too small?), " if wrong is rules[-1][1] and out.sum() > valid.sum() / 2 else ""
+            )
+            repairs.append(Repair(most + kind, int(out.sum()), text))
             valid &= ~wrong
     return valid, repairs
 
@@ -131,9 +133,7 @@ def _spans(
 def _place(trajectories: Trajectories, values: np.ndarray, run: str) -> np.ndarray:
     filled = columns.filled(values)
     if filled is None:
-        raise DataError(
-            f"{trajectories.source}: place column {trajectories.place!r} is empty in run {run}; name another."
-        )
+        raise DataError(f"{trajectories.source}: column {trajectories.place!r} is empty in run {run}; name another.")
     return filled
 
 

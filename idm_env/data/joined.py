@@ -40,9 +40,7 @@ def joined(paths: Sequence[str | Path], *, layout: str = "auto", columns: Column
             parts.append(copies / f"{len(parts)}.parquet")
             clean.identifiers(rows, file.name).write_parquet(parts[-1])
     if len(leaders) > 1:
-        raise DataError(
-            f"{leaders[False]} has no column leader_id, and {leaders[True]} has one; give it to all files or to none."
-        )
+        raise DataError(f"{leaders[False]} lacks the column leader_id of {leaders[True]}; give it to all or none.")
     label = path.name if len(paths) == 1 and path.is_dir() else f"{files[0].name} and {len(files) - 1} more"
     copy = copies / f"{label}.parquet"
     pl.concat([pl.scan_parquet(part, glob=False) for part in parts], how="diagonal_relaxed").sink_parquet(copy)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import gzip
 import io
 import re
 import zipfile
@@ -17,6 +16,7 @@ from idm_env.data import drones, folder, ngsim, openacc, pair, plain, tidy, ultr
 from idm_env.data.errors import DataError, Repair, listed, missing_column, nearest
 from idm_env.data.names import Columns, check_columns, renamed, unread
 from idm_env.data.schema import TIDY
+from idm_env.data.sizes import read_parquet, read_whole, unpacked
 from idm_env.data.trajectories import Trajectories, parted
 
 LAYOUTS = ("auto", "tidy", "ngsim", "openacc", "ultra_av", *drones.CSV, *drones.FILES)
@@ -213,8 +213,7 @@ def _pieces(path: Path, extension: str, written: dict[str, Any]) -> Iterator[pl.
                 if not has_rows:
                     yield empty
             return
-        opener = gzip.open if extension == ".csv.gz" else open
-        with opener(path, "rb") as file:
+        with unpacked(path) as file:
             head = file.readline()
             rows = file.readlines(BATCH_BYTES)
             while True:
@@ -305,17 +304,14 @@ def _plain(path: Path) -> Path:
         return path
     try:
         return plain.plain(path) if path.name.lower().endswith(EXTENSIONS) else path
-    except DataError:
-        raise
     except (*_UNREADABLE, zipfile.BadZipFile) as error:
         raise _unreadable(path, error) from None
 
 
 def _first_lines(path: Path, count: int) -> list[str]:
-    opener = gzip.open if path.name.lower().endswith(".gz") else open
     try:
-        with opener(path, "rt", encoding="utf-8", errors="replace") as file:
-            lines = [str(file.readline(_LONGEST)) for _ in range(count)]
+        with io.TextIOWrapper(unpacked(path), encoding="utf-8", errors="replace") as file:
+            lines = [file.readline(_LONGEST) for _ in range(count)]
     except _UNREADABLE as error:
         raise _unreadable(path, error) from None
     if max(map(len, lines)) == _LONGEST:
@@ -326,10 +322,12 @@ def _first_lines(path: Path, count: int) -> list[str]:
 def _table(path: Path, extension: str, written: dict[str, Any], skip: int = 0, rows: int | None = None) -> pl.DataFrame:
     try:
         if extension == ".parquet":
-            return pl.read_parquet(path.absolute(), n_rows=rows, glob=False)  # polars takes a leading ~ for a home
-        whole: Path | bytes = path.absolute()
-        if rows is not None:  # polars would unpack a csv.gz as a whole
+            return read_parquet(path, rows)
+        if rows is not None:
             whole = "".join(_first_lines(path, skip + 1 + rows)).encode()
+        else:
+            with unpacked(path) as file:
+                whole = read_whole(file, path.name)
         return pl.read_csv(whole, skip_rows=skip, infer_schema_length=None, null_values=_MISSING, glob=False, **written)
     except _UNREADABLE as error:
         raise _unreadable(path, error) from None
@@ -352,6 +350,8 @@ def _odd_line(path: Path) -> str:
 
 def _unreadable(path: Path, error: BaseException) -> DataError:
     """Return the error in one line; of what is packed, two libraries would say the same fault in two ways."""
+    if isinstance(error, DataError):
+        return error
     packed = next((kind for kind in ("parquet", "gz") if path.name.lower().endswith(f".{kind}")), None)
     reason = str(error).strip().splitlines()[0][:150] if str(error).strip() else type(error).__name__
     if packed and not getattr(error, "errno", None):

@@ -23,6 +23,7 @@ import polars as pl
 
 from idm_env.data import ngsim
 from idm_env.data.errors import DataError
+from idm_env.data.sizes import read_whole
 
 ENDINGS = (".txt", ".tsv", ".fzp", ".xml", ".xlsx", ".zip", ".txt.gz", ".xml.gz")
 """Of files that are read by way of a copy, beside those of csv that need one."""
@@ -79,7 +80,7 @@ def _rewritten(path: Path, files: ExitStack) -> Iterable[str] | None:
         if len(members) != 1:
             raise DataError(f"{path.name} holds {len(members)} files; unpack it, and name one or its folder.")
         raw, name = files.enter_context(archive.open(members[0])), members[0].lower()
-    file = files.enter_context(gzip.GzipFile(fileobj=raw)) if name.endswith(".gz") else raw
+    file: Any = files.enter_context(gzip.GzipFile(fileobj=raw)) if name.endswith(".gz") else raw
     head = file.read(HEAD)
     if head.lstrip()[:1] == b"<" or ".xml" in name:
         return _of_sumo(path, head, file)
@@ -93,7 +94,7 @@ def _rewritten(path: Path, files: ExitStack) -> Iterable[str] | None:
     odd = first.startswith(("#", "$", "*")) or first.lower().startswith("sep=")
     if not (odd or numbers or trailing or encoding != "utf-8" or path.name.lower().endswith((".zip", ".txt.gz"))):
         return None
-    lines = (head + file.read()).decode(encoding, "replace").removeprefix("\ufeff").splitlines()
+    lines = (head + read_whole(file, path.name)).decode(encoding, "replace").removeprefix("\ufeff").splitlines()
     mark = lines.pop(0)[4:] if first.lower().startswith("sep=") else ""
     header = next((line for line in lines if line.startswith("$VEHICLE:")), None)
     rows = [line for line in lines if line.strip() and not line.startswith(("#", "$", "*"))]

@@ -197,8 +197,7 @@ def _cuts(track: np.ndarray, time: np.ndarray, position: np.ndarray) -> np.ndarr
     step, seconds = np.diff(position[rows]), np.diff(time[rows])
     far = (np.abs(step) > np.maximum(HIGHEST_SPEED_MPS * seconds, JUMP_M)) | (step < -FALL_M)
     bend = np.abs(np.diff(step)) > BEND_M + BEND_MPS2 * seconds[1:] * seconds[:-1]
-    even = np.abs(np.diff(seconds)) < 0.5 * seconds[1:]
-    sharp = bend & even & same[1:] & same[:-1]
+    sharp = bend & (np.abs(np.diff(seconds)) < 0.5 * seconds[1:]) & same[1:] & same[:-1]
     far[1:-1] |= sharp[1:] & sharp[:-1]  # unlike the steps before and after, which are alike
     cut[rows[1:]] = far & same
     return cut

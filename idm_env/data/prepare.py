@@ -69,7 +69,8 @@ def prepare(
     steps = clock.steps_of(clock.paces(frame), frame["run_id"].unique(), source)
     frame = then(clock.regularise(frame, steps))
     frame = then(speeds.complete(frame, steps))
-    frame = then(leaders.steady(then(_led(_with_lane(frame), source, clean.on_clock(hidden, frame, steps)))))
+    hidden = clean.on_clock(hidden, frame, steps)
+    frame = then(leaders.steady(then(_led(_with_lane(frame), source, hidden, steps))))
     frame = then(leaders.gaps(frame, source))
     overlaps = plausible.Overlaps()
     overlaps.add(frame)
@@ -79,7 +80,9 @@ def prepare(
     return schema.check(_arranged(frame), source), steps, done
 
 
-def _led(frame: pl.DataFrame, source: str, hidden: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
+def _led(
+    frame: pl.DataFrame, source: str, hidden: pl.DataFrame, steps: dict[str, float]
+) -> tuple[pl.DataFrame, list[Repair]]:
     if "leader_id" in frame.columns:
         frame, counts = leaders.named_leaders(frame, frame)
         if (counts["state"] == "none").all():
@@ -88,12 +91,13 @@ def _led(frame: pl.DataFrame, source: str, hidden: pl.DataFrame) -> tuple[pl.Dat
                 "column to have leaders derived from lane and position."
             )
         return frame, leaders.named(counts, source)
-    everybody = pl.concat([frame, hidden], how="diagonal").with_columns(
+    unseen, holes = clock.unseen(frame, steps)
+    everybody = pl.concat([frame, hidden, unseen], how="diagonal").with_columns(
         leaders.in_lane(pl.col("lane").is_not_null().any().over("run_id"))
     )
     frame = leaders.derive(everybody).head(frame.height)  # who is there without a position is still ahead of somebody
     followers = frame.filter(pl.col("leader_id").is_not_null()).select(schema.TRACK).n_unique()
-    return frame.drop("in_lane"), [leaders.derived(followers, frame["lane"].null_count() < frame.height)]
+    return frame.drop("in_lane"), [*holes, leaders.derived(followers, frame["lane"].null_count() < frame.height)]
 
 
 def _with_ring(frame: pl.DataFrame, ring_length: float | None, source: str) -> pl.DataFrame:

@@ -127,8 +127,7 @@ class RecordColumns:
         length = float(self.length[rows[present][0]]) if present.any() else DEFAULT_LENGTH_M
         # Where one neighbour takes the place of another of other length, its rear end is what a gap is measured to.
         position = position - self._length_of(rows) + length
-        away = position if elsewhere is None else elsewhere
-        place = np.where(present, position, away)
+        place = np.where(present, position, position if elsewhere is None else elsewhere)
         speed = np.where(present, self.speed[rows], own_speed)
         accel = np.where(present, self.accel[rows], 0.0)
         if smooth:

@@ -101,8 +101,7 @@ def smooth(
         scaled = np.abs(estimate - target) * np.sqrt(position_weight)
         weights = np.maximum(position_weight * np.minimum(1.0, 2.0 / np.maximum(scaled, 1e-9)), lowest)
         estimate = _solve(target, rates, dt, weights, speed_weight, penalty)
-    rate = _speed(estimate, dt)
-    return SmoothMotion(estimate + origin, rate, _accel(estimate, dt))
+    return SmoothMotion(estimate + origin, _speed(estimate, dt), _accel(estimate, dt))
 
 
 def _solve(

@@ -125,9 +125,7 @@ class Trajectories:
         runs = self.runs()
         items: list = runs if len(runs) > 1 else self.followers()
         if len(items) < 2:
-            raise DataError(
-                f"{self.source}: one driver only, so that nothing can be held out; give more drivers or runs."
-            )
+            raise DataError(f"{self.source}: one driver only, and nothing can be held out; give more drivers or runs.")
         count = min(max(1, round(fraction * len(items))), len(items) - 1)
         order = np.random.default_rng(seed).permutation(len(items))
         test_items, fit_items = ([items[i] for i in sorted(part)] for part in (order[:count], order[count:]))

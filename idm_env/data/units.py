@@ -38,9 +38,7 @@ def check(frame: pl.DataFrame, source: str, longest_step: float = LONGEST_STEP_S
     if "speed_mps" in frame.columns:
         _check_ratio(frame, source, step)
     if step is not None and step > longest_step:
-        raise DataError(
-            f"{source}: time_s rises by {step:g} s from row to row; is it in milliseconds or frames? Use seconds."
-        )
+        raise DataError(f"{source}: time_s rises by {step:g} s a row; is it in milliseconds or frames? Use seconds.")
     if "length_m" in frame.columns:
         lengths = frame["length_m"].drop_nulls()
         median = lengths.median() if len(lengths) else None
@@ -109,9 +107,7 @@ def check_gaps(joined: pl.DataFrame, source: str) -> None:
     low, ratio, high = (pairs.select((pl.col("given") / pl.col("derived")).quantile(q)).item() for q in (0.2, 0.5, 0.8))
     for factor, wrong in ((FOOT, "gap_m looks like feet"), (1.0 / FOOT, "position_m looks like feet")):
         if 0.9 * factor < low <= high < 1.1 * factor:
-            raise DataError(
-                f"{source}: gap_m is {ratio:.3g} times the gap between the positions; {wrong}: multiply it by 0.3048."
-            )
+            raise DataError(f"{source}: gap_m is {ratio:.3g} times the positions' gap; {wrong}: multiply it by 0.3048.")
 
 
 def implausible(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:

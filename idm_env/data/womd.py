@@ -6,7 +6,6 @@ with geometry by type, ``metadata.tracks_to_predict``. TFRecord is the official 
 
 from __future__ import annotations
 
-import gzip
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from idm_env.data import womd_record
 from idm_env.data.errors import DataError
 from idm_env.data.scenario import PRESENT, SHOWN, Agent, MapLane, Scenario, TrafficControl, check_scenario
+from idm_env.data.sizes import read_whole, unpacked
 
 _STATES = (
     "unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go", "flashing_stop", "flashing_caution",
@@ -53,10 +53,11 @@ def count(path: str | Path) -> int:
 def read_json(path: str | Path) -> Scenario:
     """Return the scenario of one JSON file. DataError if it is no such file."""
     path = Path(path)
-    opener = gzip.open if path.name.lower().endswith(".gz") else open
     try:
-        with opener(path, "rt", encoding="utf-8") as file:
-            content = json.load(file)
+        with unpacked(path) as file:
+            content = json.loads(read_whole(file, path.name))
+    except DataError:
+        raise
     except (OSError, EOFError, ValueError, RecursionError) as error:
         raise DataError(f"{path.name} cannot be read ({str(error)[:120]}); is it complete JSON?") from None
     if not isinstance(content, dict) or not content.get("objects"):
@@ -82,8 +83,7 @@ def _scenario(content: dict[str, Any], source: str) -> Scenario:
         elif road.get("type") == "stop_sign" and len(line):
             controls.append(TrafficControl("sign", line[0]))
     controls += _signals(content.get("tl_states"))
-    metadata = content.get("metadata") or {}
-    chosen = metadata.get("tracks_to_predict")
+    chosen = (content.get("metadata") or {}).get("tracks_to_predict")
     if chosen is None:
         targets = tuple(i for i, agent in enumerate(agents) if agent.valid[PRESENT])
         notes.append("the file names no tracks_to_predict: every agent valid at the present step is predicted")

@@ -183,8 +183,7 @@ def _split(prepared: Records, share: float, seed: int) -> tuple[list[str], list[
     if len(runs) < 2:
         return runs, []
     count = min(max(1, round(share * len(runs))), len(runs) - 1)
-    order = np.random.default_rng(seed).permutation(len(runs))
-    test = {runs[i] for i in order[:count]}
+    test = {runs[i] for i in np.random.default_rng(seed).permutation(len(runs))[:count]}
     return [r for r in runs if r not in test], [r for r in runs if r in test]
 
 
@@ -207,9 +206,7 @@ def _profile(prepared: Records, column: str) -> tuple[float, float, list[float]]
     # Where a record does not tell, the profile of the others is taken for the same place.
     recorded = [e for e in prepared.episodes if column in e.columns]
     if not recorded:
-        raise ValueError(
-            f"a profile over places needs the column {column} without holes, and no record has it. Fill it in."
-        )
+        raise ValueError(f"a profile over places needs the column {column} without holes, and none has it. Fill it in.")
     place = np.concatenate([e.place_m for e in recorded])
     value = np.concatenate([e.columns[column] for e in recorded])
     period = prepared.period

@@ -122,8 +122,7 @@ def _residual(d: Discovery) -> list[np.ndarray]:
     shown = []
     for s in (d.null, d.final)[: len(d.judgement.titles)]:
         errors = problem.errors(s.theta[None], s.model, s.values[None])[0]
-        seconds = errors[:, 1:-2:2]
-        shown.append(-np.diff(seconds, axis=1, prepend=0.0))
+        shown.append(-np.diff(errors[:, 1:-2:2], axis=1, prepend=0.0))
     return shown
 
 

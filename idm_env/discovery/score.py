@@ -129,8 +129,7 @@ def westfall_young(gains: np.ndarray, seed: int = 0, run: np.ndarray | None = No
     """
     run = np.arange(gains.shape[1]) if run is None else run
     statistic = _flipped(gains, seed, run)
-    highest = statistic.max(1)
-    p_value = (highest[:, None] >= statistic[0] - 1e-12).mean(0)
+    p_value = (statistic.max(1)[:, None] >= statistic[0] - 1e-12).mean(0)
     mean, width = _mean_of(gains, run)
     return Tested(p_value, mean, np.stack([mean - width, mean + width], axis=1))
 

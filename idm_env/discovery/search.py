@@ -197,8 +197,7 @@ class Search:
                     best = solve(self.problem, model, best.theta, best.values, iterations=iterations)
             arrays = {"theta": torch.from_numpy(best.theta), "values": torch.from_numpy(best.values)}
             self.saved.put(key, {**arrays, "cost": float(best.cost)})
-        gains = log_gain(before, held_out(self.problem, best))
-        return Scored(term, best, gains)
+        return Scored(term, best, log_gain(before, held_out(self.problem, best)))
 
     def _promise(
         self, solution: Solution, term: Term, begin: Sequence[np.ndarray] | None = None

@@ -133,8 +133,7 @@ def decide(searching: Search, null: Solution, seed: int) -> Decided:
             steps.append(searching.null(chosen.model, chosen.theta, chosen.values))
     if steps:
         steps[-1] = searching.weighed(_delete(searching, steps[-1], len(null.model.terms)))[1]
-    joined = _joined(searching, null, steps, rounds, seed)
-    return Decided(null, steps, rounds, joined, fit)
+    return Decided(null, steps, rounds, _joined(searching, null, steps, rounds, seed), fit)
 
 
 def _joined(

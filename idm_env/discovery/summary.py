@@ -345,8 +345,7 @@ def absorbed(solution: Solution | None, term: Term) -> float | None:
     if solution is None or not solution.linear.by_phi.shape[-1]:
         return None
     first = solution.model.where(term.label).start
-    j = solution.linear.by_phi[..., first]
-    total = float((j**2).sum())
+    total = float((solution.linear.by_phi[..., first] ** 2).sum())
     projected = float(np.einsum("gqq->gq", solution.reduced_hessian)[:, first].sum())
     return None if total <= 0 else float(np.clip(1.0 - projected / total, 0.0, 1.0))
 

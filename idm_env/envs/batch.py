@@ -10,10 +10,11 @@ Shapes: rows are environments: states ``[rows, n]``, actions ``[rows, agents, â€
 from __future__ import annotations
 
 import contextlib
+import functools
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from idm_env.envs.given import checked
 from idm_env.envs.moves import Moves
 from idm_env.envs.recording import Recorder
 from idm_env.envs.settings import INFO, Settings
+from idm_env.jobs.storage import lacks_memory
 from idm_env.kernels import dispatch
 from idm_env.scalar.record import Unordered, Untraceable
 from idm_env.tasks import Draw, EnvState
@@ -35,6 +37,7 @@ from idm_env.validation import whole
 if TYPE_CHECKING:
     from idm_env.envs.values import Values
 
+Act = TypeVar("Act", bound=Callable[..., Any])
 _LARGEST_POOL = 100_000
 _POOL_STREAM = 2
 _NORMALS_AT_ONCE = 1 << 14
@@ -100,6 +103,23 @@ def _held(before: Outcome, after: Outcome, over: Any) -> Outcome:
 
 
 _DETAILS = tuple((name, f"info_{name}") for name in INFO)
+
+
+def in_memory(act: Act) -> Act:
+    """Return a method whose lack of memory is a MemoryError of one line, with the sizes of the batch and the cure."""
+
+    @functools.wraps(act)
+    def call(batch: Batch, *arguments: Any, **options: Any) -> Any:
+        try:
+            return act(batch, *arguments, **options)
+        except (MemoryError, RuntimeError) as error:
+            if not lacks_memory(error):
+                raise
+            cure = "Take fewer of either, or fewer steps between two calls of detach()."
+            sizes = f"num_envs = {batch.count} of {batch.task.vehicles} vehicles"
+            raise MemoryError(f"{sizes} need more memory than {batch.settings.device} has. {cure}") from None
+
+    return cast(Act, call)
 
 
 class Batch:
@@ -175,6 +195,7 @@ class Batch:
         self.episodes[rows] = -1
         self._beginnings.forget()
 
+    @in_memory
     def reset(self, rows: np.ndarray | None = None, state: State | None = None) -> Tensor | np.ndarray:
         """Begin a new episode in all or in some rows (indices); return the observations of all of them.
 
@@ -329,6 +350,7 @@ class Batch:
         self._values.back_to(mark[1])
         self._beginnings.forget()
 
+    @in_memory
     def step(self, action: Tensor | np.ndarray | None, live: Tensor | None = None) -> Outcome:
         """Advance every row; ``action`` has shape ``(n, agents)``, None leaves everybody to the drivers.
 

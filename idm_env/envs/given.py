@@ -34,9 +34,7 @@ def checked(given: Any, like: State, road: Road) -> State:
     gaps that are not those of the positions.
     """
     if not isinstance(given, State):
-        raise ValueError(
-            f"options['state'] is of type {type(given).__name__}: give a State, such as env.unwrapped.state."
-        )
+        raise ValueError(f"options['state'] is of type {type(given).__name__}: give a State like env.unwrapped.state.")
     expected, leaves = dict(_leaves(like)), dict(_leaves(given))
     for name in expected:
         if name not in leaves:
@@ -75,9 +73,7 @@ def _fitting(name: str, x: Any, like: Tensor | None, state: State, road: Road) -
     if x.shape != like.shape and not (
         broad and all(a in (1, b) for a, b in zip(x.shape[::-1], like.shape[::-1], strict=False))
     ):
-        raise ValueError(
-            f"{here} has shape {tuple(x.shape)}, and {tuple(like.shape)} is needed: environments, vehicles."
-        )
+        raise ValueError(f"{here} has shape {tuple(x.shape)}; {tuple(like.shape)} is needed: environments, vehicles.")
     low = 0.0 if name.startswith(_FROM_0) and name != _ENDLESS[0] else -_MOST
     high = math.inf if name in _ENDLESS else _MOST
     if name in _LANES:

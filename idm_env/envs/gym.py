@@ -166,9 +166,7 @@ class Face(Pictures):
             raise ValueError("a window of unroll is not recorded. Call step() while recording, or make another batch.")
         mode = self.batch.settings.autoreset_mode
         if mode is not AutoresetMode.SAME_STEP:
-            raise ValueError(
-                f"autoreset_mode = '{mode.value}': unroll begins anew within the step. Make it with 'SameStep'."
-            )
+            raise ValueError(f"autoreset_mode = '{mode.value}': unroll begins anew within the step. Use 'SameStep'.")
         affordable(self.batch.settings, self.batch.count, whole("steps", steps, 1, 10**9))
         return unroll(self.batch, policy, steps, push, hidden)
 

@@ -6,8 +6,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,9 +25,11 @@ SIZE, WIDE = 600, 1000
 LANE_M, VEHICLE_M = 3.5, 1.9
 """Widths of a lane and of a vehicle (m)."""
 _NEAR = 85.0
-"""How far from the agent one sees on a ring of several lanes and on an endless road (m): so much is drawn to scale."""
-_TOP, _EDGE = 64, 15
-"""Height of what is written above a road, and the ground on both sides of what is shown (pixels)."""
+"""How far from the agent one sees in the window around it (m): so much is drawn to scale."""
+_TOP, _EDGE, _BELOW = 72, 15, 54
+"""Where the first road is drawn, the ground on both sides of it, and between two roads (pixels)."""
+_FRAMES = 10
+"""Pictures a second in a window."""
 _LANE_PIXELS = 12.0, 20.0
 """A lane's width at least and at most; where the least is more than to scale, the picture says how much."""
 _TICKS_M = 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0
@@ -39,16 +40,17 @@ _CHANGE, _CRASH, _PAINT = (208, 60, 150), (255, 210, 0), (226, 226, 220)
 _CLOSED, _STOP, _PASS = (150, 130, 120), (225, 25, 25), (40, 200, 110)
 COLOURS_DRAWN = (_ASPHALT, _GROUND, _INK, _MARK, _CHANGE, _CRASH, _PAINT, _CLOSED, _STOP, _PASS)
 """Colours of a picture besides those of speeds (red, green, blue)."""
+_Point = tuple[float, float]
+_Values = dict[str, np.ndarray]
 _CHANGE_SHOWN = 1.0
-"""How long an arrow shows that a vehicle has changed lanes (s)."""
+"""How long a line shows that a vehicle has changed lanes (s)."""
 
 
 def colour(speed: float, fastest: float) -> tuple[int, int, int]:
     """Return the colour of a speed: red at standstill, over yellow, to green at ``fastest`` and above."""
-    x = min(max(speed / fastest, 0.0), 1.0) * (len(COLOURS) - 1)
-    left = min(int(x), len(COLOURS) - 2)
-    mixed = COLOURS[left] + (x - left) * (COLOURS[left + 1] - COLOURS[left])
-    return int(mixed[0]), int(mixed[1]), int(mixed[2])
+    place = min(max(speed / fastest, 0.0), 1.0) * (len(COLOURS) - 1)
+    red, green, blue = (int(np.interp(place, range(len(COLOURS)), COLOURS[:, k])) for k in range(3))
+    return red, green, blue
 
 
 def panels_of(task: Task, states: Sequence[State]) -> list[Panel]:
@@ -70,29 +72,35 @@ def _pygame() -> Any:
     return pygame
 
 
-def _around(task: Task, values: dict[str, np.ndarray], ring: float | None) -> None:
-    """Leave only what is near the first agent, at places beside it: a whole road would be too small to see."""
-    first = values["position"][task.agents[0]]
-    away = values["position"] - first
-    if ring is not None:
-        away = (away + 0.5 * ring) % ring - 0.5 * ring
-    values["position"] = first + away
-    values["present"] = values["present"] * (np.abs(away) <= _NEAR)
+def _read(task: Task, state: State, row: int) -> _Values:
+    """Return the numbers of one row of a state that a picture takes: vehicles, lanes (0 on top), lap (m), time (s)."""
+    names = ("position", "speed", "gap", "length")
+    values = {name: getattr(state, name)[row].detach().cpu().numpy().astype(float) for name in names}
+    present, lanes, outline = state.present, state.lanes, task.road.outline
+    values["present"] = np.ones(task.vehicles) if present is None else present[row].detach().cpu().numpy().copy()
+    # The left lane is on top, as seen by drivers who go to the right.
+    values["lane"] = np.array(task.lanes)
+    if lanes is not None and outline is not None:
+        values["lane"] = len(outline.lanes) - 1 - lanes.lane[row].cpu().numpy()
+    lap = task.road.lap(state)
+    values["lap"] = np.array(math.nan if lap is None else float(lap.expand(len(state.speed))[row]))
+    values["time"] = np.array(float(state.step.expand(len(state.speed))[row]) * task.simulator.dt)
+    return values
 
 
-def _crashed(values: dict[str, np.ndarray]) -> np.ndarray:
+def _interpolated(before: _Values, after: _Values, share: float) -> _Values:
+    """Interpolate two steps linearly; vehicles are present where they are at both."""
+    values = {name: x + share * (after[name] - x) for name, x in before.items()}
+    return values | {"present": before["present"] * after["present"]}
+
+
+def _crashed(values: _Values) -> np.ndarray:
     """Return which vehicles touch the one ahead."""
     return np.asarray((values["gap"] <= 0.0) & (values["present"] > 0))
 
 
-def _time(task: Task, state: State, row: int) -> float:
-    """Return the time of one row of a state (s)."""
-    return float(state.step.expand(len(state.speed))[row]) * task.simulator.dt
-
-
-def _marks(task: Task, state: State, row: int, params: Params) -> list[Mark]:
-    """Return what stands on the road of one row of a state."""
-    now = _time(task, state, row)
+def _marks(task: Task, now: float, row: int, params: Params) -> list[Mark]:
+    """Return the marks on the road of one row at a time (s)."""
     marks: list[Mark] = []
     for effect in task.simulator.effects if params else ():
         own = params[effect.name].items()
@@ -100,56 +108,48 @@ def _marks(task: Task, state: State, row: int, params: Params) -> list[Mark]:
     return marks
 
 
-@dataclass(frozen=True)
-class _View:
-    """What is shown of a road: from ``back`` to ``front`` (m), ``scale`` pixels a metre, lanes so many pixels wide."""
+class _View(NamedTuple):
+    """What is shown of a road, below ``top`` (pixels): from ``back`` to ``front`` (m), lanes so many pixels wide."""
 
     back: float
     front: float
     lanes: int
     lane: float
+    top: float = _TOP
 
     @property
     def scale(self) -> float:
         return (WIDE - 2 * _EDGE) / (self.front - self.back)
 
     @property
-    def wider(self) -> float:
-        """How many times as large widths are drawn as lengths."""
-        return self.lane / (LANE_M * self.scale)
-
-    @property
     def bottom(self) -> float:
         """Where the road ends below (pixels)."""
-        return _TOP + self.lanes * self.lane
-
-    @property
-    def step(self) -> float:
-        """Metres between numbers along the road."""
-        return next((m for m in _TICKS_M if m * self.scale > 70.0), _TICKS_M[-1])
+        return self.top + self.lanes * self.lane
 
     def x(self, position: float) -> float:
         """Return the pixel of a position (m)."""
         return WIDE - _EDGE - (self.front - position) * self.scale
 
-    def y(self, lane: int) -> float:
+    def y(self, lane: float) -> float:
         """Return the pixel of a lane's middle; lane 0 is on top."""
-        return _TOP + (lane + 0.5) * self.lane
+        return self.top + (lane + 0.5) * self.lane
 
 
-def _view(task: Task, values: dict[str, np.ndarray], lanes: int) -> _View:
-    """Return the whole of a road that ends, else what is around its vehicles, at least 170 m."""
-    on_road = values["present"] > 0
-    outline = task.road.outline
+def _views(task: Task, values: _Values, ego: int) -> list[_View]:
+    """Return the whole of a road that ends, and a window around the ego; else all vehicles, or a window."""
+    outline, place, on_road = task.road.outline, values["position"], values["present"] > 0
+    lanes = min(max(task.lanes) + 1, _MOST_LANES) if outline is None else len(outline.lanes)
+    middle, wide = float(place[ego]), _LANE_PIXELS[1]
     if outline is not None and outline.length is not None:
         pixels = LANE_M * (WIDE - 2 * _EDGE) / outline.length
-        return _View(0.0, outline.length, lanes, float(np.clip(pixels, *_LANE_PIXELS)))
-    if outline is not None:
-        middle = float(values["position"][task.agents[0]])
-        return _View(middle - _NEAR, middle + _NEAR, lanes, _LANE_PIXELS[1])
-    front = float(values["position"][on_road].max()) if on_road.any() else 2.0 * _NEAR
-    back = float((values["position"] - values["length"])[on_road].min()) if on_road.any() else 0.0
-    return _View(min(back, front - 2.0 * _NEAR), front, lanes, _LANE_PIXELS[1])
+        whole = _View(0.0, outline.length, lanes, float(np.clip(pixels, *_LANE_PIXELS)))
+        middle = min(max(middle, _NEAR), max(outline.length - _NEAR, _NEAR))
+        return [whole, _View(middle - _NEAR, middle + _NEAR, lanes, wide, whole.bottom + _BELOW)]
+    if outline is None and on_road.any():
+        back, front = float((place - values["length"])[on_road].min()), float(place[on_road].max())
+        if front - back < 4.0 * _NEAR:
+            return [_View(min(back, front - 2.0 * _NEAR), front, lanes, wide)]
+    return [_View(middle - _NEAR, middle + _NEAR, lanes, wide)]
 
 
 class Viewer:
@@ -160,12 +160,11 @@ class Viewer:
     """
 
     def __init__(self, mode: str, fps: int) -> None:
-        self._pygame = _pygame()
-        self._mode = mode
-        self._fps = fps
+        self._pygame, self._mode, self._fps = _pygame(), mode, fps
         self._window: Any = None
         self._clock: Any = None
-        self._lanes: np.ndarray | None = None
+        self._last: _Values | None = None
+        self._ego = 0
         self._changes: dict[int, tuple[int, float]] = {}
         self._pygame.font.init()
         self._font, self._small = (self._pygame.font.Font(None, size) for size in (24, 20))
@@ -175,55 +174,64 @@ class Viewer:
 
         With the ``params`` of its episodes, what stands on the road is drawn, too.
         """
-        ring = state.lanes is None and task.road.lap(state) is not None
-        lane, lanes = np.array(task.lanes), min(max(task.lanes) + 1, _MOST_LANES)
-        outline = task.road.outline
-        if outline is not None and state.lanes is not None:
-            # The left lane is on top, as seen by drivers who go to the right.
-            lanes = len(outline.lanes)
-            lane = lanes - 1 - state.lanes.lane[row].cpu().numpy()
-        values = {
-            name: getattr(state, name)[row].detach().cpu().double().numpy()
-            for name in ("position", "speed", "gap", "length")
-        }
-        everybody = np.ones(task.vehicles)
-        values["present"] = everybody if state.present is None else state.present[row].detach().cpu().numpy()
-        values["lane"] = lane
-        self._watch(task, state, row, lane)
-        if outline is not None and outline.length is None:
-            _around(task, values, outline.ring)
-        fastest = 10.0 if ring else 30.0
-        view = _view(task, values, lanes)
-        canvas = self._pygame.Surface((SIZE, SIZE) if ring else (WIDE, 2 * math.ceil(0.5 * (view.bottom + 34))))
+        values, params = _read(task, state, row), params or {}
+        before, self._last = self._last, values
+        self._watch(before, values)
+        self._look(task, values["present"], values["position"])
+        if self._mode != "human":
+            picture = self._picture(task, values, row, params)
+            return np.transpose(self._pygame.surfarray.array3d(picture), (1, 0, 2)).copy()
+        frames, moments = max(1, round(_FRAMES / self._fps)), [values]
+        if before is not None and abs(values["time"] - before["time"] - task.step_time) < 1e-3:
+            moments = [_interpolated(before, values, k / frames) for k in range(1, frames)] + moments
+        for each in moments:
+            self._display(self._picture(task, each, row, params), frames)
+        return None
+
+    def _picture(self, task: Task, values: _Values, row: int, params: Params) -> Any:
+        """Return a surface with the roads, what stands on them, and the legend."""
+        outline, lap = task.road.outline, float(values["lap"])
+        if outline is None and lap > 0.0:
+            canvas = self._pygame.Surface((SIZE, SIZE))
+            canvas.fill(_GROUND)
+            self._ring(canvas, task, values)
+            self._legend(canvas, task, values, None, ())
+            return canvas
+        if lap > 0.0:
+            own = values["position"][self._ego]
+            values = {**values, "position": own + (values["position"] - own + 0.5 * lap) % lap - 0.5 * lap}
+        views, marks = _views(task, values, self._ego), _marks(task, float(values["time"]), row, params)
+        canvas = self._pygame.Surface((WIDE, 2 * math.ceil(0.5 * (views[-1].bottom + 34))))
         canvas.fill(_GROUND)
-        if ring:
-            self._ring(canvas, task, values, fastest)
-        else:
-            self._lane(canvas, task, values, fastest, view, _marks(task, state, row, params or {}))
-        self._legend(canvas, task, state, row, values, fastest, 1.0 if ring else view.wider)
-        if self._mode == "human":
-            self._display(canvas)
-            return None
-        return np.transpose(self._pygame.surfarray.array3d(canvas), (1, 0, 2)).copy()
+        for view in views:
+            self._lane(canvas, task, values, view, marks)
+        if len(views) > 1:
+            left, right, y = views[0].x(views[1].back), views[0].x(views[1].front), views[0].top
+            self._pygame.draw.lines(canvas, _MARK, False, [(left, y), (left, y - 5), (right, y - 5), (right, y)])
+        self._legend(canvas, task, values, views[0], marks)
+        return canvas
 
-    def _watch(self, task: Task, state: State, row: int, lane: np.ndarray) -> None:
-        """Keep who has changed lanes in the last second, and from where."""
-        now = _time(task, state, row)
-        self._changes = {
-            i: (old, since) for i, (old, since) in self._changes.items() if 0.0 <= now - since <= _CHANGE_SHOWN
-        }
-        if self._lanes is not None and len(self._lanes) == len(lane):
-            for i in np.flatnonzero(np.abs(lane - self._lanes) == 1):
-                self._changes[int(i)] = int(self._lanes[i]), now
-        self._lanes = lane.copy()
+    def _look(self, task: Task, present: np.ndarray, position: np.ndarray) -> None:
+        """Keep the agent in the middle of the window while it is there; then take the last one on the road."""
+        agents = [i for i in task.agents if present[i] > 0]
+        if agents and self._ego not in agents:
+            self._ego = task.agents[0] if len(agents) == len(task.agents) else min(agents, key=lambda i: position[i])
 
-    def _ring(self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float) -> None:
-        circumference = float((values["gap"] + values["length"]).sum())
+    def _watch(self, before: _Values | None, values: _Values) -> None:
+        """Keep the lane that each vehicle has left in the last second, and the time (s)."""
+        now, lane = float(values["time"]), values["lane"]
+        self._changes = {i: x for i, x in self._changes.items() if 0.0 <= now - x[1] <= _CHANGE_SHOWN}
+        if before is not None:
+            for i in np.flatnonzero(np.abs(lane - before["lane"]) == 1):
+                self._changes[int(i)] = int(before["lane"][i]), now
+
+    def _ring(self, canvas: Any, task: Task, values: _Values) -> None:
+        circumference = float(values["lap"])
         radius, middle, level = 0.38 * SIZE, 0.5 * SIZE, 0.53 * SIZE  # below the legend
         pixels = 2.0 * math.pi * radius / circumference
         lane = max(LANE_M * pixels, 18.0)
 
-        def place(position: float, away: float = 0.0) -> tuple[tuple[float, float], float]:
+        def place(position: float, away: float = 0.0) -> tuple[_Point, float]:
             angle = 2.0 * math.pi * (position % circumference) / circumference
             far = radius + away
             return (middle + far * math.cos(angle), level - far * math.sin(angle)), angle
@@ -234,24 +242,22 @@ class Viewer:
             ends = [place(post, 0.5 * lane + away)[0] for away in (2.0, 8.0)]
             self._pygame.draw.line(canvas, _INK, *ends)
             self._text(canvas, f"{post:.0f} m", place(post, 0.5 * lane + 24.0)[0])
-        crashed = _crashed(values)
+        tip, ends = place(0.26 * circumference, -30.0)[0], [place(0.24 * circumference, x)[0] for x in (-35.0, -25.0)]
+        self._pygame.draw.polygon(canvas, _INK, [tip, *ends])
         for i, (position, length) in enumerate(zip(values["position"], values["length"], strict=True)):
             centre, angle = place(position - 0.5 * length)
             size = length * pixels, VEHICLE_M / LANE_M * lane
-            self._vehicle(canvas, centre, angle + 0.5 * math.pi, size, values["speed"][i], fastest, i in task.agents)
-        for position in values["position"][crashed]:
+            fill = colour(values["speed"][i], 10.0)
+            self._vehicle(canvas, centre, angle + 0.5 * math.pi, size, fill, i in task.agents)
+        for position in values["position"][_crashed(values)]:
             self._crash(canvas, place(position)[0])
 
-    def _lane(
-        self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float, view: _View,
-        marks: Sequence[Mark],
-    ) -> None:  # fmt: skip
+    def _lane(self, canvas: Any, task: Task, values: _Values, view: _View, marks: Sequence[Mark]) -> None:
         draw = self._pygame.draw
         outline = task.road.outline
-        lap = None if outline is None else outline.ring
+        lap, length = (None, None) if outline is None else (outline.ring, outline.length)
         for lane in range(view.lanes):
-            first, last = view.back - 1e4, view.front + 1e4
-            stops = math.inf
+            first, last, stops = view.back - 1e4, view.front + 1e4, math.inf
             if outline is not None and lap is None:
                 first, stops, leaves = outline.lanes[-1 - lane]
                 last = min(stops, leaves, last)
@@ -264,30 +270,30 @@ class Viewer:
                 draw.line(canvas, _PAINT, *((x, top) for x in ends))
             if stops < view.front:
                 draw.line(canvas, _CRASH, (right, top), (right, top + view.lane), 3)
-        for post in np.arange(view.step * math.ceil(view.back / view.step), view.front + 1e-6, view.step):
+        step = next((m for m in _TICKS_M if m * view.scale > 70.0), _TICKS_M[-1])
+        for post in np.arange(step * math.ceil(view.back / step), view.front + 1e-6, step):
             x = view.x(post)
             draw.line(canvas, _INK, (x, view.bottom + 3), (x, view.bottom + 9))
             self._text(canvas, f"{post if lap is None else post % lap:.0f} m", (x, view.bottom + 20))
         for standing in marks:
             self._stands(canvas, standing, view)
+        if length is not None:  # nobody is seen where there is no road
+            begin, end = max(view.x(0.0), 0.0), min(view.x(length), float(WIDE))
+            canvas.set_clip((begin, 0, end - begin, canvas.get_height()))
         for i in np.flatnonzero(values["present"] > 0):
             x = view.x(values["position"][i] - 0.5 * values["length"][i])
-            y = view.y(int(values["lane"][i]) % view.lanes)
+            y = view.y(values["lane"][i] % view.lanes)
             size = values["length"][i] * view.scale, VEHICLE_M / LANE_M * view.lane
-            self._vehicle(canvas, (x, y), 0.0, size, values["speed"][i], fastest, i in task.agents)
-            if int(i) in self._changes:
-                # An arrow from the lane that it has left.
-                before = view.y(self._changes[int(i)][0])
-                side = math.copysign(1.0, y - before)
-                draw.line(canvas, _CHANGE, (x, before), (x, y - 0.3 * view.lane * side), 3)
-                tip = y - 0.1 * view.lane * side
-                draw.polygon(canvas, _CHANGE, [(x, tip), (x - 5, tip - 7 * side), (x + 5, tip - 7 * side)])
+            if int(i) in self._changes:  # a line from the lane that it has left
+                draw.line(canvas, _CHANGE, (x, view.y(self._changes[int(i)][0])), (x, y), 3)
+            self._vehicle(canvas, (x, y), 0.0, size, colour(values["speed"][i], 30.0), i in task.agents)
         for i in np.flatnonzero(_crashed(values)):
-            self._crash(canvas, (view.x(values["position"][i]), view.y(int(values["lane"][i]) % view.lanes)))
+            self._crash(canvas, (view.x(values["position"][i]), view.y(values["lane"][i] % view.lanes)))
+        canvas.set_clip(None)
 
     def _stands(self, canvas: Any, mark: Mark, view: _View) -> None:
         """Draw a stretch that is closed, or a line: in red where one must stop, else in green."""
-        top, bottom = float(_TOP), view.bottom
+        top, bottom = view.top, view.bottom
         if mark.lane is not None:
             middle = view.y(view.lanes - 1 - mark.lane)
             top, bottom = middle - 0.5 * view.lane, middle + 0.5 * view.lane
@@ -296,60 +302,71 @@ class Viewer:
             self._pygame.draw.rect(canvas, _CLOSED, (left, top, right - left, bottom - top))
         if view.back <= mark.begin <= view.front:
             self._pygame.draw.line(canvas, _STOP if mark.stops else _PASS, (left, top), (left, bottom), 4)
+            if mark.begin == mark.end:
+                self._head(canvas, (left, view.top - 10.0), mark.stops)
 
-    def _crash(self, canvas: Any, place: tuple[float, float]) -> None:
+    def _head(self, canvas: Any, place: _Point, stops: bool) -> None:
+        """Draw a signal: its red lamp is on the left, its green one on the right."""
+        self._pygame.draw.rect(canvas, _INK, (place[0] - 11, place[1] - 7, 22, 14))
+        for side, lit, on in ((-5, _STOP, stops), (5, _PASS, not stops)):
+            self._pygame.draw.circle(canvas, lit if on else _ASPHALT, (place[0] + side, place[1]), 4)
+
+    def _crash(self, canvas: Any, place: _Point) -> None:
         """Draw a cross where two vehicles touch."""
         self._pygame.draw.circle(canvas, _CRASH, place, 11)
         self._pygame.draw.circle(canvas, _INK, place, 11, 2)
-        for side in (-1, 1):
-            ends = (place[0] - 5, place[1] - 5 * side), (place[0] + 5, place[1] + 5 * side)
-            self._pygame.draw.line(canvas, _INK, *ends, 3)
+        self._text(canvas, "X", place)
 
-    def _text(self, canvas: Any, words: str, place: tuple[float, float]) -> None:
-        """Write small words around a place, within the picture."""
+    def _text(self, canvas: Any, words: str, place: _Point, left: float = 0.5) -> float:
+        """Write small words, a share of them ``left`` of a place, within the picture; return where the next begin."""
         image = self._small.render(words, True, _INK)
-        half = 0.5 * image.get_width()
-        x = min(max(place[0], half + 2), canvas.get_width() - half - 2)
-        canvas.blit(image, (x - half, place[1] - 0.5 * image.get_height()))
+        wide = float(image.get_width())
+        x = min(max(place[0] - left * wide, 2.0), canvas.get_width() - wide - 2.0)
+        canvas.blit(image, (x, place[1] - 0.5 * image.get_height()))
+        return x + wide + 20.0
 
-    def _vehicle(
-        self, canvas: Any, centre: tuple[float, float], heading: float, size: tuple[float, float], speed: float,
-        fastest: float, marked: bool,
-    ) -> None:  # fmt: skip
-        """Draw a vehicle of a length and a width (pixels) in the colour of its speed; a controlled one has a frame."""
+    def _vehicle(self, canvas: Any, centre: _Point, heading: float, size: _Point, fill: Any, marked: bool) -> None:
+        """Draw a vehicle of a length and a width (pixels) in a colour; a controlled one has a frame."""
         c, s = math.cos(heading), -math.sin(heading)
-        for more, fill in ((3.0, _MARK), (0.0, colour(speed, fastest))) if marked else ((0.0, colour(speed, fastest)),):
+        for more, paint in ((3.0, _MARK), (0.0, fill))[not marked :]:
             half, side = max(0.5 * size[0], 2.0) + more, max(0.5 * size[1], 2.0) + more
             corners = [(-half, -side), (half, -side), (half, side), (-half, side)]
             points = [(centre[0] + x * c - y * s, centre[1] + x * s + y * c) for x, y in corners]
-            self._pygame.draw.polygon(canvas, fill, points)
+            self._pygame.draw.polygon(canvas, paint, points)
         self._pygame.draw.polygon(canvas, _INK, points, 1)
 
-    def _legend(
-        self, canvas: Any, task: Task, state: State, row: int, values: dict[str, np.ndarray], fastest: float,
-        wider: float,
-    ) -> None:  # fmt: skip
-        on_road = values["present"] > 0
+    def _legend(self, canvas: Any, task: Task, values: _Values, view: _View | None, marks: Sequence[Mark]) -> None:
+        on_road, draw, fastest = values["present"] > 0, self._pygame.draw, 10.0 if view is None else 30.0
         mean = float(values["speed"][on_road].mean()) if on_road.any() else 0.0
-        seconds = _time(task, state, row)
         crash = "   crash" if _crashed(values).any() else ""
-        text = f"{task.name}   t = {seconds:.1f} s   mean speed {mean:.1f} m/s{crash}"
+        text = f"{task.name}   t = {float(values['time']):.1f} s   mean speed {mean:.1f} m/s{crash}"
         canvas.blit(self._font.render(text, True, _INK), (12, 10))
-        left, top, width = 12, 36, 120
-        for x in range(width):
-            self._pygame.draw.line(canvas, colour(x / width * fastest, fastest), (left + x, top), (left + x, top + 8))
-        self._pygame.draw.rect(canvas, _MARK, (left + width + 110, top - 1, 20, 10))
-        canvas.blit(self._small.render(f"0 to {fastest:.0f} m/s", True, _INK), (left + width + 8, top - 3))
-        label = "agent" + ("" if wider < 1.5 else f"      widths are drawn {wider:.0f} times as large")
-        canvas.blit(self._small.render(label, True, _INK), (left + width + 136, top - 3))
+        level, width = 40, 120
+        for x in range(12, 12 + width):
+            draw.line(canvas, colour((x - 12) / width * fastest, fastest), (x, level - 4), (x, level + 4))
+        after = self._text(canvas, f"0 to {fastest:.0f} m/s", (width + 20, level), 0.0)
+        self._vehicle(canvas, (after + 10, level), 0.0, (18, 8), colour(5.0, 10.0), True)
+        after = self._text(canvas, "agent", (after + 30, level), 0.0)
+        for mark in marks:
+            if mark.begin == mark.end:
+                self._head(canvas, (after + 11, level), mark.stops)
+                after = self._text(canvas, "traffic light", (after + 30, level), 0.0)
+        kinds = [("closed", _CLOSED)] * any(mark.begin < mark.end for mark in marks)
+        for name, fill in kinds + [("lane change", _CHANGE)] * bool(self._changes):
+            draw.rect(canvas, fill, (after, level - 4, 18, 8))
+            after = self._text(canvas, name, (after + 26, level), 0.0)
+        if view is None:
+            return
+        draw.polygon(canvas, _INK, [(after, level - 5), (after + 16, level), (after, level + 5)])
+        after = self._text(canvas, "direction of travel", (after + 24, level), 0.0)
+        if (wider := view.lane / (LANE_M * view.scale)) >= 1.5:
+            self._text(canvas, f"widths above: × {wider:.0f}", (after, level), 0.0)
 
-    def _display(self, canvas: Any) -> None:
+    def _display(self, canvas: Any, frames: int) -> None:
         pygame = self._pygame
         if self._window is None:
-            headless = sys.platform.startswith("linux") and not (
-                os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-            )
-            if headless:
+            display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+            if sys.platform.startswith("linux") and not display:
                 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
             pygame.display.init()
             self._window = pygame.display.set_mode(canvas.get_size())
@@ -359,7 +376,7 @@ class Viewer:
         pygame.event.pump()
         pygame.display.flip()
         if os.environ.get("SDL_VIDEODRIVER") != "dummy":
-            self._clock.tick(self._fps)
+            self._clock.tick(self._fps * frames)
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -32,9 +32,7 @@ class SB3VecEnv(VecEnv):
     def __init__(self, vector_env: VectorEnv) -> None:
         mode = vector_env.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
-            raise ValueError(
-                f"autoreset_mode = {mode} does not fit SB3. Make the vector with autoreset_mode='SameStep'."
-            )
+            raise ValueError(f"autoreset_mode = {mode} does not fit SB3. Make one with autoreset_mode='SameStep'.")
         settings = getattr(vector_env.unwrapped, "settings", None)
         if settings is not None and settings.output != "numpy":
             raise ValueError(f"output = '{settings.output}' does not fit SB3, which takes arrays. Use output='numpy'.")

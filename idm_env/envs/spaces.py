@@ -63,9 +63,7 @@ def action_of(action: Any, shape: tuple[int, ...], made: Settings) -> Tensor | n
     if not whole:
         raise ValueError(f"an action of type {x.dtype} is not a number. Give floats in [-1, 1].")
     if x.shape != shape:
-        raise ValueError(
-            f"action has shape {tuple(x.shape)}, and {shape} is needed: one number per controlled vehicle."
-        )
+        raise ValueError(f"action has shape {tuple(x.shape)}; {shape} is needed: one number per controlled vehicle.")
     held = x.detach() if isinstance(x, Tensor) else x
     finite = torch.isfinite if isinstance(x, Tensor) else np.isfinite
     if not (math.isfinite(held.item()) if math.prod(shape) == 1 else finite(held).all()):

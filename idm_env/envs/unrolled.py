@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.envs.batch import Batch
+from idm_env.envs.batch import Batch, in_memory
 from idm_env.envs.policy_call import NO_NUMBERS, policy_outputs
 from idm_env.kernels import dispatch
 from idm_env.scalar.record import Untraceable
@@ -37,6 +37,7 @@ class Unrolled(NamedTuple):
     hidden: Tensor | None = None
 
 
+@in_memory
 def unroll(
     batch: Batch, policy: Callable[..., Any], steps: int, push: Tensor | None, hidden: Tensor | None
 ) -> Unrolled:

@@ -91,9 +91,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
                 f"least one True."
             )
         if not self.batch.begun and not mask.all():
-            raise ValueError(
-                "options['reset_mask'] leaves environments out before the first reset. Reset all of them once."
-            )
+            raise ValueError("options['reset_mask'] leaves environments out before the first reset. Reset all once.")
         return np.flatnonzero(mask)
 
     def _seed(self, seed: int | Sequence[int | None] | None, rows: np.ndarray) -> None:
@@ -107,9 +105,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         else:
             seeds = list(seed)
             if len(seeds) != self.num_envs:
-                raise ValueError(
-                    f"seed has {len(seeds)} values for {self.num_envs} environments: give one number or one each."
-                )
+                raise ValueError(f"seed has {len(seeds)} values for {self.num_envs} environments: give 1 or as many.")
             if not self.batch.begun and None in seeds:
                 self.batch.seed(np.arange(self.num_envs), self._entropy())
         seeded = [row for row in rows if seeds[row] is not None]
@@ -130,9 +126,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         mode = self.autoreset_mode
         over = np.flatnonzero(self._ended)
         if len(over) and mode is AutoresetMode.DISABLED:
-            raise RuntimeError(
-                f"environments {over[:5].tolist()} have ended. Reset them with options={{'reset_mask': mask}}."
-            )
+            raise RuntimeError(f"environments {over[:5].tolist()} are over. Reset with options={{'reset_mask': mask}}.")
         batch_actions = None if actions is None else action_of(actions, self._shape, self.settings)
         with torch.no_grad() if self._numpy else contextlib.nullcontext():
             outcome = self.batch.step(batch_actions)

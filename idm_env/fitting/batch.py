@@ -163,9 +163,7 @@ class Batch:
         taking = {e.name: e.takes for e in simulator.effects if e.takes is not None}
         for name, what in taking.items():
             if what not in measured:
-                raise DataError(
-                    f"effect '{name}' takes an input that measured data do not have. Remove it from the model."
-                )
+                raise DataError(f"effect '{name}' takes an input that measured data do not have. Remove it.")
         inputs = {name: measured[what] for name, what in taking.items()}
         return simulator.drawn(position[0], inputs, len(position), seed)
 

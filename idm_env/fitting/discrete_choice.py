@@ -229,8 +229,7 @@ def fit_choice(
         )
         for start in starts or model.starts()
     ]  # fmt: skip
-    best = min(ends, key=lambda end: float(end.fun))
-    theta = torch.tensor(best.x, dtype=torch.float64)
+    theta = torch.tensor(min(ends, key=lambda end: float(end.fun)).x, dtype=torch.float64)
     span = torch.tensor(high - low)
     at_bound = torch.minimum(theta - torch.tensor(low), torch.tensor(high) - theta) < 1e-6 * span
     error = torch.full_like(theta, torch.nan)

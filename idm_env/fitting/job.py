@@ -264,9 +264,8 @@ def _fit_page(result: dict[str, Any], joined: JoinedFit, table: list[dict[str, A
         lead += f" On {held['episodes']} episodes of held-out {held['parts']}: {held['gap_rmse_m']:.2f} m."
     rows = [{"": "fitted", **result["fit"]}] + ([] if held is None else [{"": f"held-out {held['parts']}", **held}])
     figures = joined.pictures
-    several = (
-        [page.note(f"Pictures are of the first of {len(joined.summaries)} parts.")] if joined.summaries[1:] else []
-    )
+    parts = len(joined.summaries)
+    several = [page.note(f"Pictures are of the first of {parts} parts.")] if parts > 1 else []
     titles = ("Measured and simulated", "Residuals", "In space and time")
     return [
         *([page.lead(result["failed"])] if result["failed"] else []),

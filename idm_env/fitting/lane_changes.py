@@ -197,9 +197,7 @@ def _sentence(fit: LaneChanges, compared: list[dict[str, Any]]) -> str:
         verdicts.append(f"{word} {row['model']} ({gain:+.1f} ± {error:.1f})")
     unknown = [row["parameter"] for row in fit.mobil.table() if not row["identified"]]
     doubt = f" Not identified by these data: {', '.join(map(str, unknown))}." if unknown else ""
-    few = (
-        f" {decisions.changes} changes are few: take these numbers as a description." if decisions.changes < FEW else ""
-    )
+    few = f" {decisions.changes} changes are few: they describe only." if decisions.changes < FEW else ""
     return (
         f"{decisions.changes} lane changes in {len(decisions)} decisions. On drivers whom the fit has not seen, by "
         f"log-likelihood, MOBIL is {' and '.join(verdicts)}.{doubt}{few}"

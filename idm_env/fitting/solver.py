@@ -230,8 +230,7 @@ def _together(
     # The last trial leaves φ where it is, and every group decides for itself.
     better = costs[-1:] < now.cost
     costs[-1:] = torch.where(better, costs[-1:], now.cost)
-    stiffness_cost = (stiff * shared.square()).sum()
-    total = float(now.cost.sum() + stiffness_cost)
+    total = float(now.cost.sum() + (stiff * shared.square()).sum())
     sums = costs.sum(-1) + (stiff * trial_shared.square()).sum(-1)
     best = int(sums.argmin())
     gain = total - float(sums[best])

@@ -23,9 +23,7 @@ ATTRIBUTES = {
 def refuse(path: Path, base: str) -> None:
     """Raise ValueError, in one line, for a law that SUMO has not, and for a file that ``write`` has not written."""
     if base != "idm":
-        raise ValueError(
-            f"--sumo writes the types of IDM, and the law is {base}. Leave --sumo out, or take --base idm."
-        )
+        raise ValueError(f"--sumo writes the types of IDM, and the law is {base}. Leave --sumo out, or use --base idm.")
     if path.exists() and not (path.is_file() and _MARK in path.read_text(errors="replace")):
         raise ValueError(f"{path} was not written by idm-env fit. Move it, or give --sumo another name.")
     refuse_unwritable(path, "--sumo")

@@ -52,8 +52,7 @@ def effective_samples(residual: Tensor, weight: Tensor) -> Tensor:
     covariance = torch.fft.irfft(spectrum.abs().square(), size, dim=0)[: len(residual)]
     rho = covariance / covariance[0].clamp_min(1e-300)
     positive = torch.cumprod((rho > 0).to(rho.dtype), dim=0)
-    time = 2.0 * (rho * positive).sum(0) - 1.0
-    return count / time.clamp_min(1.0)
+    return count / (2.0 * (rho * positive).sum(0) - 1.0).clamp_min(1.0)
 
 
 def uncertainty(problem: Problem, own: Tensor, shared: Tensor) -> Uncertainty:

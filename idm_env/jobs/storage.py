@@ -76,6 +76,12 @@ def full(error: BaseException) -> str | None:
     return os.strerror(numbers[0]) if numbers else None
 
 
+def lacks_memory(error: BaseException) -> bool:
+    """Return whether an error is a lack of memory: torch has no class for it on a CPU, and says so in words."""
+    words = ("can't allocate memory", "out of memory")
+    return isinstance(error, MemoryError) or any(word in str(error) for word in words)
+
+
 def write_text(path: Path, content: str) -> None:
     """Write a text file in one piece."""
     write(path, lambda part: part.write_text(content, encoding="utf-8"))

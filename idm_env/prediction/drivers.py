@@ -94,8 +94,7 @@ class Second:
 def quantiles(count: int, dimensions: int = 10) -> np.ndarray:
     """Return evenly spread points [count, dimensions] of the unit cube, the same at every call."""
     power = max(1, int(np.ceil(np.log2(count))))
-    points = qmc.Sobol(dimensions, seed=0).random_base2(power)[:count]
-    return np.clip(points, 1e-3, 1 - 1e-3)
+    return np.clip(qmc.Sobol(dimensions, seed=0).random_base2(power)[:count], 1e-3, 1 - 1e-3)
 
 
 def hypotheses(second: Second) -> list[DriverHypothesis]:

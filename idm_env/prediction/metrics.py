@@ -55,8 +55,7 @@ def speed_scale(speed: float) -> float:
 
 def at_two_hertz(seconds: int) -> np.ndarray:
     """Return the indices, at 10 Hz from the first future step on, of the samples up to ``seconds``."""
-    stride = RATE // PER_SECOND
-    return np.arange(1, seconds * PER_SECOND + 1) * stride - 1
+    return np.arange(1, seconds * PER_SECOND + 1) * (RATE // PER_SECOND) - 1
 
 
 def displacement(case: Case, seconds: int) -> tuple[np.ndarray, np.ndarray]:

@@ -128,8 +128,7 @@ def as_published(scene: MapScene, index: int) -> Prediction:
     ``trajectories.paper`` optimises and drives, behind the real leader, which drives by its own fit; stop lines,
     branches and bends are not looked at. Constant velocity off the lanes.
     """
-    agent = scene.valid(index)
-    routes = scene.routes(agent)
+    routes = scene.routes(scene.valid(index))
     if not routes:
         return straight_on(scene, index)
     along = routes[0].begin + published_distance(scene, index, {})

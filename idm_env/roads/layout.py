@@ -90,9 +90,7 @@ class LaneLayout:
             seen.add(end.lane)
             if end.closed and end.end <= max(end.begin, 0.0):
                 begin = max(end.begin, 0.0)
-                raise ValueError(
-                    f"lane {end.lane} ends at {end.end:g} m, and begins at {begin:g} m: it must end later."
-                )
+                raise ValueError(f"lane {end.lane} ends at {end.end:g} m, and begins at {begin:g} m: end it later.")
             last = ENDLESS if self.length is None else self.length
             if not end.begin <= max(end.opens, end.begin) < end.closes <= end.end <= last:
                 raise ValueError(

@@ -90,8 +90,7 @@ def _refused(graph: Graph, what: str) -> Untraceable:
 
 
 def _apply(name: str, args: Any, kwargs: dict[str, Any]) -> Scalar:
-    first = next(a for a in (*_flat(args), *kwargs.values()) if isinstance(a, Scalar))
-    graph = first.graph
+    graph = next(a for a in (*_flat(args), *kwargs.values()) if isinstance(a, Scalar)).graph
     plain = name.strip("_")
     if plain not in FUNCTIONS:
         raise _refused(graph, f"torch.{plain}")

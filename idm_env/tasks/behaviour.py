@@ -43,9 +43,7 @@ def _tensor(name: str, value: Any, vehicles: int, dtype: torch.dtype, device: to
         return value.to(device=device, dtype=dtype)
     if isinstance(value, Sequence) and not isinstance(value, str):
         if len(value) != vehicles:
-            raise ValueError(
-                f"{name} has {len(value)} values for {vehicles} vehicles: give one number or one per vehicle."
-            )
+            raise ValueError(f"{name} has {len(value)} values for {vehicles} vehicles: give one or one per vehicle.")
         return torch.tensor([number(name, x) for x in value], dtype=dtype, device=device)
     return torch.tensor(number(name, value), dtype=dtype, device=device)
 

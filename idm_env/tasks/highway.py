@@ -82,9 +82,8 @@ class HighwayTask(LanesTask):
         position = -(rank * self._room).to(like.dtype) + 0.5 * free * aside
         speed = torch.full_like(position, min(0.5 * free, 20.0))
         step, lane = torch.full((len(position),), -self.warmup, device=like.device), index % self.lanes_count
-        return EnvState(
-            self.simulator.state(position, speed, params, length=self.vehicle_length, step=step, lane=lane), {}
-        )
+        state = self.simulator.state(position, speed, params, length=self.vehicle_length, step=step, lane=lane)
+        return EnvState(state, {})
 
     def apart(self, ahead: Tensor) -> Tensor:
         """Return differences of positions (m) as distances round the ring, the shorter way."""

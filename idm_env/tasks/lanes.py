@@ -203,10 +203,8 @@ class LanesTask(Task):
 
         in_sight = away.gather(-1, near) <= FAR_AWAY
         present = torch.stack([in_sight[..., k] for k in range(count)], -2).to(lane.dtype)
-        columns = [
-            present,
-            *(x * present for x in (self.apart(beside(state.position)), beside(lane), beside(state.speed))),
-        ]
+        others = self.apart(beside(state.position)), beside(lane), beside(state.speed)
+        columns = [present, *(x * present for x in others)]
         if count < self.seen:
             columns = [torch.cat((x, x.new_zeros(*x.shape[:-2], self.seen - count, agents)), dim=-2) for x in columns]
         return tuple(columns)

@@ -316,8 +316,7 @@ class OpenLanesTask(LanesTask):
         for k in sorted(self.inflows):
             mine = torch.nonzero(some & (lane == k)).squeeze(-1)
             times = headway[:, mine].cumsum(-1)
-            cycle = mean[mine[0]] * len(mine)
-            cycles = cycle / self._demand(draw, k)
+            cycles = mean[mine[0]] * len(mine) / self._demand(draw, k)
             departs[:, mine] = times * (cycles / times[:, -1:])
             again[:, mine] = cycles
         order = departs.argsort(dim=-1, stable=True)

@@ -126,13 +126,9 @@ class PlatoonTask(BehindHeadTask):
         speed, last = self.pick(state.speed), state.speed[..., -1:]
         off, off_last = speed - self.speed, last - self.speed
         time_gap = self.pick(state.gap) / speed.clamp_min(1.0)
-        reward = (
-            -(off * off + off_last * off_last) / (2.0 * self.disturbance**2)
-            - 0.1 * command * command
-            - 2.0 * torch.relu(1.0 - time_gap / 0.8)
-            - torch.relu(time_gap / 4.0 - 1.0)
-        )
-        return floored(reward, _KNEE, _LOWEST)
+        close, far = 2.0 * torch.relu(1.0 - time_gap / 0.8), torch.relu(time_gap / 4.0 - 1.0)
+        reward = -(off * off + off_last * off_last) / (2.0 * self.disturbance**2) - 0.1 * command * command
+        return floored(reward - close - far, _KNEE, _LOWEST)
 
 
 def _deviation(mean: float, view: AgentView) -> Tensor:

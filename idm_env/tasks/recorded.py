@@ -46,8 +46,7 @@ def made_up_leader(dt: float, seconds: float = 600.0) -> Leaders:
     # A soft floor keeps the speed positive and the acceleration continuous where a wave stops the traffic.
     speed = np.logaddexp(0.0, 2.0 * speed) / 2.0
     position = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * (dt / fine))))
-    accel = np.gradient(speed, dt / fine)
-    motion = np.stack((position, speed, accel), axis=-1)[::fine]
+    motion = np.stack((position, speed, np.gradient(speed, dt / fine)), axis=-1)[::fine]
     return Leaders(motion[None], np.array([len(motion)]))
 
 

@@ -182,13 +182,9 @@ class ReplayTask(Task):
         by_id = {key: i for i, key in enumerate(self.scene.ids) if key != NOBODY}
         slots = [i for key, i in by_id.items() if str(vehicle) in (key, key.rsplit("/", 1)[-1])]
         if not slots:
-            raise ValueError(
-                f"vehicle '{vehicle}' is not in the recording.{nearest(str(vehicle), list(by_id)[:200])[:160]}"
-            )
+            raise ValueError(f"vehicle '{vehicle}' is not recorded.{nearest(str(vehicle), list(by_id)[:200])[:160]}")
         if len(slots) > 1:
-            raise ValueError(
-                f"vehicle '{vehicle}' is in {len(slots)} runs. Name one of them: '{self.scene.ids[slots[0]]}'."
-            )
+            raise ValueError(f"vehicle '{vehicle}' is in {len(slots)} runs. Name one: '{self.scene.ids[slots[0]]}'.")
         return slots[0]
 
     @cached_property

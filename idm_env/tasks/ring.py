@@ -116,9 +116,7 @@ class RingTask(Task):
                 "Control fewer, or leave shock out."
             )
         vehicle = self.shock_vehicle
-        if vehicle is None:
-            return
-        if vehicle >= self.vehicles or vehicle in self.agents:
+        if vehicle is not None and (vehicle >= self.vehicles or vehicle in self.agents):
             raise ValueError(
                 f"shock_vehicle = {vehicle} must be a human driver of vehicles 0 … {self.vehicles - 1}; agents control "
                 f"{', '.join(map(str, self.agents))}."
@@ -186,10 +184,8 @@ class RingTask(Task):
             shift = amplitude * free * (ripple.cumsum(-1) - ripple)
             speed = (free * (1.0 + amplitude * ripple.roll(1, -1)) - 2.0).clamp_min(0.0)
         position = -place * length - shift
-        speed, step = (
-            speed.expand_as(position).contiguous(),
-            torch.full((len(length),), -self.warmup, device=like.device),
-        )
+        speed = speed.expand_as(position).contiguous()
+        step = torch.full((len(length),), -self.warmup, device=like.device)
         around: dict[str, Any] = {"length": self.vehicle_length, "circumference": length.squeeze(-1)}
         return EnvState(self.simulator.state(position, speed, params, step=step, **around), self._shocks(draw))
 

@@ -123,8 +123,7 @@ def _bounded_block(
     inequality = np.vstack([speed, accel, -accel])
     # a hair inside, so that rounding never breaks the bound
     limit = np.concatenate([np.zeros(len(speed)), np.full(2 * len(accel), -bound * (1 - 1e-6))])
-    coefficients = _least_squares(matrix, target, inequality, limit)
-    spline = BSpline(knots, coefficients, 3)
+    spline = BSpline(knots, _least_squares(matrix, target, inequality, limit), 3)
     return RegularMotion(clock, spline(clock) + position_m[0], spline(clock, 1), spline(clock, 2))
 
 

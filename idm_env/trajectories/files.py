@@ -179,8 +179,7 @@ def _strand(strand: _Strand, progress: OnProgress) -> None:
     parts, settings, borders = strand.parts, strand.settings, strand.shelf.borders
     recent: list[Filtered] = []
     for number in strand.numbers:
-        table = strand.shelf.table(number)
-        pieces = Pieces(table, strand.bridge)
+        pieces = Pieces(strand.shelf.table(number), strand.bridge)
         tracks = list(pieces)
         recent = [f for f in recent if tracks and _reaches(f, tracks)]
         begin, end = borders[number], borders[number + 1]

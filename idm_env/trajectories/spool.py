@@ -27,8 +27,6 @@ KEPT = ("run_id", "vehicle_id", "time_s", "position_m", "leader_id", "lane", "le
 MOST_BUCKETS = 64
 BUCKET_ROWS = 400_000
 """Rows of a bucket of times."""
-BRIDGED_S = 2.0
-"""Holes up to this are filled before leaders are looked for (s)."""
 LONGEST_STEP_S = 60.0
 """Sparse tracks have a sample at least so often (s); above, times are in another unit."""
 
@@ -185,7 +183,7 @@ class Spool:
             if "leader_id" in frame.columns:
                 frame, counts = leaders.named_leaders(self._jumps.with_leaders(frame), vehicles)
                 named.append(counts)
-            ticks, _ = clock.regularise(frame, steps, starts, BRIDGED_S)
+            ticks, _ = clock.regularise(frame, steps, starts, clock.UNSEEN_S)
             files.append(self.folder / f"ticks-{chunk:05d}.parquet")
             storage.write(files[-1], ticks.with_columns(pl.lit(chunk).alias("chunk")).write_parquet)
         if named:

@@ -160,9 +160,11 @@ def test_lost_leaders_are_left_out_by_a_rule_that_can_be_set() -> None:
     table = platoon(vehicles=2, seconds=20).with_columns(gap_m=pl.lit(10.0))
     made = make(with_value(table, "gap_m", list(range(300, 310)), 80.5))
     found = episodes(made)
-    assert kinds(found.left_out)["leader lost"] == 10
+    assert kinds(found.left_out)["gap above 80 m"] == 10
     assert "80 m" in " ".join(map(str, found.left_out))
     assert [len(e) for e in episodes(made, max_gap=None)] == [200]
+    made = make(with_value(table, "gap_m", list(range(290, 400)), 80.5))
+    assert kinds(episodes(made).left_out) == {"most rows (is --max-gap too small?), gap above 80 m": 110}
     assert [len(e) for e in episodes(made, max_gap=90.0)] == [200]
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import polars as pl
 import pytest
@@ -128,10 +126,3 @@ def test_a_place_column_that_wraps() -> None:
 def test_slices_and_iteration(five: Episodes) -> None:
     assert isinstance(five[:2], Episodes) and len(five[:2]) == 2
     assert [episode.key for episode in five] == [five[i].key for i in range(len(five))]
-
-
-def test_many_vehicles_are_fast() -> None:
-    made = Trajectories.from_frame(platoon(vehicles=100, seconds=100.0))
-    begun = time.perf_counter()
-    assert len(episodes(made)) == 99
-    assert time.perf_counter() - begun < 5.0

@@ -327,15 +327,14 @@ def test_wrapped_positions_on_a_ring_are_unwrapped() -> None:
         assert np.allclose(np.diff(episode.position_m), np.diff(episode.time_s) * episode.speed_mps[:-1], atol=0.02)
 
 
-def test_a_million_rows_in_seconds() -> None:
-    """Leaders of many vehicles: the pace is checked loosely, on a tenth of a million rows."""
-    import time
-
-    table = platoon(vehicles=100, seconds=100.0).drop("leader_id")
-    begun = time.perf_counter()
-    made = Trajectories.from_frame(table)
-    assert time.perf_counter() - begun < 5.0
-    assert len(made.followers()) == 99
+def test_who_drives_behind_a_hole_follows_nobody_else_meanwhile() -> None:
+    """A vehicle that is not measured for 5 s is still ahead; after 15 s nobody knows."""
+    table = platoon(vehicles=3, seconds=40.0).drop("leader_id", "gap_m", strict=False)
+    for seconds, leaders in ((5.0, {"2"}), (15.0, {"2", "1"})):
+        hole = pl.col("time_s").is_between(10.05, 10.05 + seconds) & (pl.col("vehicle_id") == 2)
+        made = Trajectories.from_frame(table.filter(~hole))
+        assert set(made.table.filter(vehicle_id="3")["leader_id"]) == leaders
+        assert kinds(made.repairs).get("hole", 0) == (seconds < 10)
 
 
 def test_splits() -> None:

@@ -46,7 +46,7 @@ def test_each_file_is_a_run_and_the_rest_is_as_in_one_file(tmp_path: Path) -> No
 def test_what_does_not_fit_the_others_is_named(tmp_path: Path) -> None:
     one, two = recordings(tmp_path / "drives")
     platoon().drop("leader_id").write_csv(two)
-    with pytest.raises(DataError, match=r"02_tracks\.csv has no column leader_id, and 01\.csv has one"):
+    with pytest.raises(DataError, match=r"02_tracks\.csv lacks the column leader_id of 01\.csv"):
         joined([one, two])
     platoon().drop("vehicle_id").write_csv(two)
     assert "02_tracks.csv: column 'vehicle_id' is missing" in refused("fit", one, two, "--out", tmp_path / "out")

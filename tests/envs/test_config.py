@@ -16,6 +16,7 @@ from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.model_file import Model, load_environment, load_model, save_model
 from idm_env.tasks import TASKS, make_task
 
+pytestmark = pytest.mark.usefixtures("torch_path")
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 GOOD = {"configures": "model", "effects": ["idm", "brakes"], "parameters": {"idm": {"time_gap": 1.1}}}
 
@@ -55,7 +56,7 @@ def test_a_model_comes_back_the_same(tmp_path):
         ({"parameter": {}}, "Did you mean 'parameters'"),
         ({"schema": 9}, "reads schema 1"),
         ({"integration": "eulr"}, "Did you mean 'euler'"),
-        ({"configures": "environment"}, "a model is wanted"),
+        ({"configures": "environment"}, "not a model"),
         ({"dt": 0}, "dt = 0 s is outside"),
         ({"dt": 100}, "dt = 100 s is outside .0, 5. s: no step may be longer than a driver's time gap"),
         ({"dt": 2}, "dt = 2 s is longer than the shortest time gap, idm.time_gap = 1.1 s"),

@@ -110,6 +110,7 @@ def test_a_picture_is_as_long_as_it_was_asked_for(tmp_path, monkeypatch):
     assert [len(line.time) for line in panel.lines] == [3100] * 3
 
 
+@pytest.mark.usefixtures("torch_path")
 def test_a_picture_of_a_task_whose_actions_are_held_is_as_long_as_it_was_asked_for(monkeypatch):
     """Its lines lie at the seconds of the environment: a vehicle's way over them is its speed."""
     monkeypatch.setattr(cli, "_work_begins", lambda: None)

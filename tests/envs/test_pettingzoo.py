@@ -12,8 +12,9 @@ from pettingzoo.test.state_test import state_test
 from idm_env.envs import pettingzoo as diffidm
 from idm_env.envs.pettingzoo import env, parallel_env, raw_env
 
+uncompiled = pytest.mark.usefixtures("torch_path")
+"""For what is asked of many environments; those of QUICK are compiled."""
 QUICK = {"controlled": 3, "warmup": 5}
-
 
 EVERYBODY = [
     {"controlled": "all", "vehicles": 5, "length": 80.0, "warmup": 5},
@@ -28,12 +29,14 @@ TRIPS = [
 ]
 
 
+@uncompiled
 @pytest.mark.filterwarnings("error::UserWarning")
 @pytest.mark.parametrize("keywords", [QUICK, *EVERYBODY], ids=str)
 def test_parallel_api(keywords):
     parallel_api_test(parallel_env(**keywords, max_cycles=40), num_cycles=60)
 
 
+@uncompiled
 @pytest.mark.filterwarnings("ignore:No agents present but not all possible_agents")
 @pytest.mark.parametrize("keywords", TRIPS, ids=str)
 def test_parallel_api_where_agents_come_and_go(keywords):
@@ -41,6 +44,7 @@ def test_parallel_api_where_agents_come_and_go(keywords):
     parallel_api_test(parallel_env(**keywords, max_cycles=40), num_cycles=60)
 
 
+@uncompiled
 @pytest.mark.parametrize("keywords", [QUICK, *EVERYBODY, TRIPS[0]], ids=str)
 @pytest.mark.parametrize("make", [env, raw_env])
 def test_api(make, keywords):
@@ -65,6 +69,7 @@ def test_seeds():
     seed_test(lambda: env(**QUICK), num_cycles=20)
 
 
+@uncompiled
 def test_whoever_seeds_the_first_agents_has_seeded_those_that_begin_later():
     """The official test seeds the spaces of the agents that are there after ``reset``, and samples those of all."""
     seed_test(lambda: env(task="merge"), num_cycles=30)
@@ -128,6 +133,7 @@ def test_a_misspelled_keyword_has_a_suggestion_and_the_limit_two_names():
         parallel_env(max_cycles=7, max_episode_steps=8)
 
 
+@uncompiled
 @pytest.mark.filterwarnings("error::UserWarning")
 def test_fixed_agents_are_there_until_the_end():
     """PettingZoo's own test; and slots without a vehicle observe zeros."""
@@ -141,6 +147,7 @@ def test_fixed_agents_are_there_until_the_end():
     assert all(truncated.values()) and not many.agents
 
 
+@uncompiled
 def test_agents_of_trips_come_and_go():
     """Every trip is an agent: it appears with its vehicle, and terminates with it, however long none is there."""
     many = parallel_env(task="merge", vehicles=30, controlled=[2, 9], inflow=2400.0, ramp_inflow=500.0, max_cycles=150)

@@ -195,7 +195,7 @@ def test_a_road_is_drawn_to_scale_with_numbers_along_it():
     """A vehicle of 5 m by 1.9 m has these sides in pixels of one scale, where the road is no longer than the view."""
     env = gym.make("DiffIDM-v0", task="highway", vehicles=2, length=500.0, render_mode="rgb_array")
     env.reset(seed=1)
-    picture = env.render()[64:].astype(int)
+    picture = env.render()[72:].astype(int)
     assert picture.shape[1] == 1000
     frame = np.argwhere(np.abs(picture - BLUE).sum(-1) < 10)
     height, width = np.ptp(frame, axis=0) + 1 - 6  # the frame is 3 pixels wide
@@ -220,6 +220,7 @@ def test_a_crash_is_marked_where_it_happens(task):
     assert marked(state) == 0 and 100 < marked(state._replace(gap=gap)) < 600
 
 
+@pytest.mark.usefixtures("torch_path")
 def test_a_signal_and_a_closed_lane_are_drawn_while_they_hold():
     """The line is red for 30 s of 60 and green for as long; a stretch is closed from 2 to 4 s."""
     env = gym.make("DiffIDM-v0", task="approach", render_mode="rgb_array")
@@ -239,6 +240,28 @@ def test_a_signal_and_a_closed_lane_are_drawn_while_they_hold():
         env.step(env.action_space.sample() * 0)
         closed.append(int((env.render() == np.array([150, 130, 120])).all(-1).sum()))
     assert closed[0] == closed[3] == closed[4] == 0 and closed[1] > 100 and closed[2] > 100
+
+
+def test_a_road_that_ends_has_a_window_around_an_agent_and_nobody_beyond_its_end():
+    env = gym.make("DiffIDM-v0", task="merge", render_mode="rgb_array")
+    env.reset(seed=1)
+    while not (env.unwrapped.state.position > 900.0).any():
+        env.step(None)
+    picture = env.render()
+    assert (picture[72:108, 986:] == np.array([244, 243, 238])).all()  # no vehicle, and no road, from 900 m on
+    window = picture[162:222].astype(int)
+    assert blue(window) > 100
+
+
+def test_a_window_shows_a_step_of_a_second_in_ten_pictures(monkeypatch):
+    shown = []
+    monkeypatch.setattr(Viewer, "_display", lambda self, canvas, frames: shown.append((canvas, frames)))
+    env = gym.make("DiffIDM-v0", task="merge", render_mode="human")
+    env.reset(seed=1)
+    first = len(shown)
+    env.step(None)
+    pictures = {canvas.get_buffer().raw for canvas, _ in shown[first:]}
+    assert first == 1 and [frames for _, frames in shown] == [10] * 11 and len(pictures) == 10
 
 
 def test_axes_begin_at_0_with_the_offset_in_the_label():

@@ -186,7 +186,7 @@ def test_agents_end_one_by_one(recording):
 @pytest.mark.parametrize(
     ("keywords", "words"),
     [
-        ({"controlled": ["z"]}, "not in the recording"),
+        ({"controlled": ["z"]}, "is not recorded"),
         ({"controlled": 3}, "Control fewer"),
         ({"runs": ["q"]}, "run 'q' is not in"),
         ({"model": "some"}, "'all' or a list"),
