@@ -33,7 +33,7 @@ from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition, Weighted, weighted
 from idm_env.tasks.types import Bounds, Ended, EnvState, Features, RewardRange
 from idm_env.types import Command, Inputs, Params, State, mapped
-from idm_env.validation import whole
+from idm_env.validation import nearest, whole
 
 _NORMALS_AT_ONCE = 1 << 16
 
@@ -150,14 +150,14 @@ class Task(abc.ABC):
             raise ValueError(f"warmup_pool = {self.warmup_pool} has no use without warm-up. Give warmup=750 as well.")
         self._check_episode()
         self.params(torch.float64, "cpu")
-        _ = self._demands, self._ranges, self.held
+        _ = self.held
 
     def _check_episode(self) -> None:
         """Check what every task says of its commands, episodes and observations."""
         limits_of(self.max_command)
         if self.max_episode_steps == 0:
             raise ValueError("max_episode_steps = 0 must be at least 1, or -1 for no limit.")
-        _ = self.scaling, self.weighted
+        _ = self.scaling, self.weighted, self._demands, self._ranges
 
     # -- static facts --------------------------------------------------------------------------------------------
 
@@ -374,12 +374,12 @@ class Task(abc.ABC):
         """What else is drawn for every episode, and the ends of its range."""
         choices = self.randomise if isinstance(self.randomise, Mapping) else {}
         for name, value in choices.items():
-            plain = isinstance(value, Sequence) and "." not in str(name) and name in ranges(type(self))
-            if plain and name not in self.can_draw:
-                own = f"{', '.join(self.can_draw)}, and " if self.can_draw else ""
+            if isinstance(value, Sequence) and "." not in str(name) and name not in self.can_draw:
+                like = nearest(str(name), (*self.can_draw, *catalogue(self._behaviour.effects)))
+                own = ", ".join((*self.can_draw, "")) + "and " * bool(self.can_draw)
                 raise ValueError(
                     f"randomise.{name} cannot be drawn in task '{self.name}', where {own}parameters of drivers such as "
-                    "idm.time_gap can."
+                    f"idm.time_gap can.{like}"
                 )
         spans = {k: two_ends(f"randomise.{k}", v) for k, v in choices.items() if k in self.can_draw}
         for name, ends in spans.items():

@@ -158,18 +158,19 @@ class OpenLanesTask(LanesTask):
             at_least(f"inflow of lane {lane}", flow, 1.0, "vehicles an hour")
         total = sum(flows.values())
         round_trip, free = 3600.0 * self.vehicles / (total * self._busiest), (self.road.length or 0) / self.entry_speed
-        if self._demands and round_trip < free:
-            raise ValueError(
-                f"vehicles = {self.vehicles} makes a demand of {total * self._busiest:g} vehicles an hour impossible: "
-                f"every {round_trip:.0f} s each would enter anew, and the road takes {free:.0f} s. Take at least "
-                f"{math.ceil(total * self._busiest * free / 3600.0)}."
-            )
         for lane, flow in flows.items():
             if self.vehicles * flow < total:
                 raise ValueError(
                     f"vehicles = {self.vehicles} leaves none for lane {lane}, where {flow:g} of {total:g} vehicles an "
                     f"hour enter. Take at least {math.ceil(total / flow)}, or a less uneven inflow."
                 )
+        # Who says how many vehicles there are may let them queue.
+        if (self._demands or self.vehicles == type(self).vehicles) and round_trip < free:
+            raise ValueError(
+                f"vehicles = {self.vehicles} makes a demand of {total * self._busiest:g} vehicles an hour impossible: "
+                f"every {round_trip:.0f} s each would enter anew, and the road takes {free:.0f} s. Take at least "
+                f"{math.ceil(total * self._busiest * free / 3600.0)}."
+            )
 
     @property
     def ramp(self) -> int | None:
