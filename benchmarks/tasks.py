@@ -44,7 +44,7 @@ GIVEN: dict[str, dict[str, Any]] = {
 """Keywords of each task here: agents decide at most twice a second."""
 TRAINING: dict[str, dict[str, Any]] = {"ring": {"warmup_pool": 256}}
 """Keywords of training alone: episodes begin in one of so many worlds."""
-STEPS = {"ring": 250_000, "follow": 200_000, "platoon": 150_000, "highway": 200_000}
+STEPS = {"ring": 250_000, "follow": 200_000, "platoon": 150_000, "highway": 300_000}
 """Steps of PPO; of others 100 000."""
 SEEN = {"features": ["speed", "lead_speed", "gap"], "scaling": "raw"}
 GENERATIONS, RULES = 8, 16

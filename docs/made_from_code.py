@@ -100,6 +100,12 @@ def _environment(name: str, cls: Any) -> list[str]:
         kind = next(c for c in cls.__mro__[1:] if "Reward, " in (c.__doc__ or ""))
         parts += [_described(kind)[0], *_described(kind)[1]]
     lines = [f"# {name}", "", first, "", f"![After 40 s without commands](../../tasks/{name}.png)", ""]
+    if (ROOT / "docs" / "tasks" / f"{name}.gif").exists():
+        lines += [f"![Human drivers, and the searched rule below as an agent](../../tasks/{name}.gif)", ""]
+        lines += [
+            f"*Six times as fast: human drivers beside the searched rule (`python docs/task_pictures.py {name}`).*",
+            "",
+        ]
     # Observation, reward and end are looked for, so each has a paragraph of its own.
     lines += [re.sub(r"(?<=[.)]) (?=Reward[ ,]|Terminated )", "\n\n", paragraph) + "\n" for paragraph in parts]
     lines += [

@@ -1,24 +1,30 @@
 """Pictures of the tasks for README and the site, and of the teacher's page.
 
-``python docs/task_pictures.py`` writes docs/tasks/TASK.png, docs/teach-diagram.png and docs/teach-wave.gif.
+``python docs/task_pictures.py`` writes docs/tasks/TASK.png, docs/teach-diagram.png and docs/teach-wave.gif;
+``python docs/task_pictures.py ring follow`` writes docs/tasks/TASK.gif of these: human drivers beside an agent, the
+searched rule of ``python -m benchmarks.tasks``.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import gymnasium
-from PIL import Image, ImageSequence
+from PIL import Image, ImageDraw, ImageSequence
 
 import idm_env  # noqa: F401 (registers DiffIDM-v0)
+from idm_env.envs.render import COLOURS_DRAWN, colour
 from idm_env.tasks import TASKS
 
 FOLDER = Path(__file__).resolve().parent / "tasks"
 SECONDS, WIDTH = 40.0, 600
+SHOWN, A_SECOND = 60, 6
+"""Seconds of an episode in a moving picture, one picture each, and how many pictures are shown in a second."""
 
 
 def pictures(folder: Path = FOLDER) -> list[Path]:
@@ -39,6 +45,48 @@ def pictures(folder: Path = FOLDER) -> list[Path]:
         written.append(folder / f"{name}.png")
         picture.save(written[-1], optimize=True)
     return written
+
+
+def film(name: str, act: Any, **keywords: Any) -> list[Image.Image]:
+    """Return a picture for every second of an episode; ``act`` None is human driving."""
+    env: Any = gymnasium.make("DiffIDM-v0", task=name, render_mode="rgb_array", **keywords)
+    seen, _ = env.reset(seed=3)
+    every, images = max(1, round(1.0 / env.unwrapped.task.step_time)), []
+    for step in range(SHOWN * every):
+        if step % every == 0:
+            picture = Image.fromarray(env.render())
+            images.append(picture.resize((picture.width // 2, picture.height // 2), Image.Resampling.LANCZOS))
+        seen, _, terminated, truncated, _ = env.step(None if act is None else act(seen[None])[0])
+        if terminated or truncated:
+            break
+    return images
+
+
+def moving(name: str, folder: Path = FOLDER) -> Path:
+    """Draw human drivers and the searched rule on the same episode, beside or above each other; return the file."""
+    sys.path.insert(0, str(FOLDER.parents[1]))
+    from benchmarks.tasks import GIVEN, SEEN, searched
+
+    keywords = GIVEN.get(name, {})
+    pairs = zip(film(name, None, **keywords), film(name, searched(name), observation=SEEN, **keywords), strict=False)
+    frames = []
+    for pair in pairs:
+        wide, high = pair[0].size
+        beside = wide == high
+        frame = Image.new("RGB", (2 * wide, high + 16) if beside else (wide, 2 * (high + 16)), (244, 243, 238))
+        for k, (picture, title) in enumerate(zip(pair, ("human drivers", "agent"), strict=True)):
+            corner = (wide * k, 0) if beside else (0, (high + 16) * k)
+            frame.paste(picture, (corner[0], corner[1] + 16))
+            ImageDraw.Draw(frame).text((corner[0] + 6, corner[1] + 2), title, fill=(30, 32, 36))
+        frames.append(frame)
+    # One palette for all pictures: what does not change between two of them is then not written again.
+    colours = [*COLOURS_DRAWN, *(colour(x, 19.0) for x in range(20)), (140, 140, 138)]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([part for each in colours for part in each])
+    frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    path = folder / f"{name}.gif"
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=1000 // A_SECOND, loop=0, optimize=True)
+    return path
 
 
 def teaching(folder: Path = FOLDER.parent) -> list[Path]:
@@ -62,5 +110,5 @@ def teaching(folder: Path = FOLDER.parent) -> list[Path]:
 
 
 if __name__ == "__main__":
-    for path in [*pictures(), *teaching()]:
+    for path in map(moving, sys.argv[1:]) if sys.argv[1:] else [*pictures(), *teaching()]:
         print(path)

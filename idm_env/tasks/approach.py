@@ -138,11 +138,6 @@ class ApproachTask(OpenLanesTask):
         """The same for each lane."""
         return dict.fromkeys(range(self.lanes_count), self.inflow / self.lanes_count)
 
-    @property
-    def filled(self) -> float:
-        """Up to where vehicles are when an episode begins (m)."""
-        return 300.0
-
     def _trips(self, draw: Draw, dtype: torch.dtype) -> Trips:
         """Return trips of which those of a cycle come in its first part, at a rhythm that every later trip keeps."""
         trips = super()._trips(draw, dtype)

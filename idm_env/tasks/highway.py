@@ -14,6 +14,7 @@ from idm_env.effects import IDM, Brakes, Effect, Mobil
 from idm_env.roads import Lanes
 from idm_env.tasks.base import EnvState
 from idm_env.tasks.checks import Range
+from idm_env.tasks.features import FEATURES, Feature
 from idm_env.tasks.lanes import FASTEST, LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition
@@ -24,16 +25,17 @@ _PLACE_STREAM = 31
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HighwayTask(LanesTask):
-    """A demonstration: on a ring of lanes agents accelerate; lanes change by MOBIL, or by ``lane_commands=True``.
+    """On a ring of lanes agents accelerate; lanes change by MOBIL, or by ``lane_commands=True``.
 
     After ``highway-v0`` of HighwayEnv (Leurent 2018, https://github.com/Farama-Foundation/HighwayEnv), on a ring, so
     that traffic stays as dense as it begins. Desired speeds differ between drivers by up to ``spread`` either way.
-    Agents act as ``LanesTask`` says. It is a demonstration of lanes and commands: it pays an agent's own speed, not
-    traffic's, for which ``open_highway``, ``merge`` and ``bottleneck`` are.
+    Agents act as ``LanesTask`` says. It pays an agent's own speed, not traffic's, for which ``open_highway``, ``merge``
+    and ``bottleneck`` are.
 
-    Observation, per agent, as HighwayEnv's kinematics: own speed and lane; then, of each of the ``seen`` nearest
-    vehicles in any lane, nearest first: 1 if there is one within 200 m, how far ahead it is (m; negative behind), how
-    many lanes to the left, and its speed relative to the own one (m/s). Scales: 20 m/s, one lane, 100 m, 10 m/s.
+    Observation, per agent: own speed and lane, the leader's relative speed and gap; then, as HighwayEnv's kinematics,
+    of each of the ``seen`` nearest vehicles in any lane, nearest first: 1 if there is one within 200 m, how far ahead
+    it is (m; negative behind), how many lanes to the left, and its speed relative to the own one (m/s). Scales: 20 m/s,
+    one lane, 100 m, 10 m/s.
     Reward, per agent: ``0.9 v/40 + 0.1 (1 − (u/u_max)²)``, v its speed (at most 40 m/s) and u its command. Terminated
     where vehicles touch. Cut off after 3000 steps.
 
@@ -84,6 +86,11 @@ class HighwayTask(LanesTask):
         step, lane = torch.full((len(position),), -self.warmup, device=like.device), index % self.lanes_count
         state = self.simulator.state(position, speed, params, length=self.vehicle_length, step=step, lane=lane)
         return EnvState(state, {})
+
+    @property
+    def features_of_self(self) -> tuple[Feature, ...]:
+        """As in ``LanesTask``, and the leader's relative speed and gap: a nearest vehicle need not be on one's lane."""
+        return (*super().features_of_self, FEATURES["relative_speed"], FEATURES["gap"])
 
     def apart(self, ahead: Tensor) -> Tensor:
         """Return differences of positions (m) as distances round the ring, the shorter way."""

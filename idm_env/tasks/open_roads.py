@@ -175,8 +175,3 @@ class BottleneckTask(OpenLanesTask):
     def inflows(self) -> Mapping[int, float]:
         """A quarter for each lane."""
         return dict.fromkeys(range(4), 0.25 * self.inflow)
-
-    @property
-    def filled(self) -> float:
-        """Up to where vehicles are when an episode begins (m)."""
-        return 300.0
