@@ -326,6 +326,11 @@ class Batch:
         """Note what is observed now, after steps that were done elsewhere."""
         self._world, self._loaded, self._seen = None, True, seen.view(self.count, len(self.task.agents), -1)
 
+    def on_road(self) -> Tensor:
+        """Return which agents' vehicles are on the road ``(n, agents)``."""
+        every = torch.ones(self.count, len(self.task.agents), dtype=torch.bool, device=self.settings.device)
+        return self.task.there(self.glance().state, every)
+
     def settle(self) -> None:
         """See that the present worlds lie where compiled loops step them."""
         if self._world is not None and not self._loaded and self._values is not None:
@@ -363,9 +368,7 @@ class Batch:
         """
         self._reasons = {}
         if self.task.journeys and action is not None:
-            state = self.glance().state
-            assert state.present is not None
-            on_road = self.task.pick(state.present) > 0
+            on_road = self.on_road()
             live = on_road if live is None else live & on_road
         held = self.task.held
         outcome = self._once(action, live, held == 1)

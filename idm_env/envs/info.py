@@ -143,10 +143,13 @@ class Rows:
         info[name], info[f"_{name}"] = value, mask
 
 
-def row(info: dict[str, Any], i: int) -> dict[str, Any]:
-    """Return what the infos of a vector tell of one environment; final observations and infos are left out."""
-    return {
-        name: value[i]
-        for name, value in info.items()
-        if not name.startswith(("_", "final_")) and bool(info[f"_{name}"][i])
-    }
+def single_infos(info: dict[str, Any], count: int) -> list[dict[str, Any]]:
+    """Return the infos of ``count`` environments, without final observations and infos, from those of their vector."""
+    names = [n for n in info if not n.startswith(("_", "final_"))]
+    every = [n for n in names if info[f"_{n}"].all()]
+    columns = (info[n] for n in every)
+    infos = [dict(zip(every, cells, strict=True)) for _, *cells in zip(range(count), *columns, strict=True)]
+    for name in {*names}.difference(every):
+        for i in np.flatnonzero(info[f"_{name}"]).tolist():
+            infos[i][name] = info[name][i]
+    return infos

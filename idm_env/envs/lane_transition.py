@@ -22,7 +22,7 @@ from idm_env.envs.transition import CompiledTransition, Tables, WholeStep
 from idm_env.envs.worlds import WHOLE, Array, Group, Layout, Moment, Room, RowTable, address, named, world_of
 from idm_env.kernels import lane_change_loops
 from idm_env.kernels.lane_changes import decision, rows_of
-from idm_env.kernels.lanes import part_of, static_of
+from idm_env.kernels.lanes import static_of
 from idm_env.kernels.operands import operand
 from idm_env.kernels.rows import RowFunction, adjoint, storage
 from idm_env.multilane.demand import turned
@@ -39,12 +39,13 @@ class Crossing:
     """What becomes of lanes in one step: worlds after decisions, blocks and whole numbers, and these after the step.
 
     ``turned`` are rows in which vehicles may come and go, and ``decided`` those in which lanes were decided about;
-    ``fresh`` marks new leaders then, and ``merger`` who signals beside whom.
+    ``fresh`` marks new leaders then, and ``merger`` who signals beside whom. ``later`` are whole numbers after every
+    step until the next one like this.
     """
 
     mid: Tensor
     whole_mid: Array
-    whole_later: Array
+    later: list[Array]
     turned: Array = field(default_factory=lambda: np.empty(0, np.int64))
     decided: Array = field(default_factory=lambda: np.empty(0, np.int64))
     fresh: Array = field(default_factory=lambda: np.empty(0, np.bool_))
@@ -64,7 +65,7 @@ class Stage:
     ) -> None:  # fmt: skip
         self.plan, self.more, self._many = plan, tuple(more), many
         self._function, self._examples = function, examples
-        self.loops = RowFunction(self._then, examples, many, apart=True)
+        self.loops = RowFunction(self._then, examples, many)
 
     def _then(self, **leaves: Tensor) -> dict[str, Tensor]:
         return {f"then_{n}": x for n, x in self._function(**leaves).items()}
@@ -85,7 +86,7 @@ class Stage:
             before |= {n: gradients[n] for n in self.more if n in gradients}
             return {f"new_{n}": x for n, x in before.items()}
 
-        return RowFunction(through, {**self._examples, **passes}, self._many, apart=True)
+        return RowFunction(through, {**self._examples, **passes}, self._many)
 
     def run(self, still: Mapping[str, Array], rows: Array, own: Mapping[str, int], *begins: int) -> None:
         """Change some rows (indices): blocks and whole numbers before it, and those after it, begin there."""
@@ -123,7 +124,8 @@ class Commands:
                     if x is not None and x is normals.get(effect):
                         self.normals[slot_name(effect, part)] = f"normal_{effect}"
                     elif x is not None:
-                        out[slot_name(effect, part).replace(" ", "_")] = x
+                        wide = x.shape[-1] if x.dim() else 1
+                        out[slot_name(effect, part).replace(" ", "_")] = x.expand(step.many, wide)
             return out
 
         examples = {n: x for n, x in step.inputs.items() if n in step.sample or n in ("action", "live")}
@@ -138,6 +140,8 @@ class LaneTables(Tables):
     def __init__(self, plan: LaneTransition, layout: Layout, params: Params) -> None:
         super().__init__(plan, layout, params)
         self._arrays: list[Array] = []
+        self.by_record = any(n.startswith("then_links") for n in self.recorded.forward.outs)
+        """Whether a step itself writes who leads whom."""
         self.clock = np.empty(plan.rows, plan.real)
         self.ask = RowTable(plan.commands.loops, layout.still | plan.room.arrays, plan.groups(""))
         self.decides: Any = None if plan.found is None else self._decision(plan.found)
@@ -168,7 +172,12 @@ class LaneTables(Tables):
 
     def _source(self, name: str) -> tuple[Array | str | int, tuple[int, int, int]]:
         """Return an array, the name of what is given with every step, or the number of a block; and its strides."""
-        plan, loops, by_vehicle = self.plan, self.plan.commands.loops, (0, self.plan.size, 1)
+        plan, loops, own, by_vehicle = (
+            self.plan,
+            self.plan.commands.loops,
+            name.replace(" ", "_"),
+            (0, self.plan.size, 1),
+        )
         block = f"memory_{name.removeprefix('memory of ')}" if name.startswith("memory of ") else f"state_{name}"
         if block in self.layout.blocks:
             return self.layout.blocks.index(block), by_vehicle
@@ -181,16 +190,9 @@ class LaneTables(Tables):
             return operand(x.to(plan.world.state.speed.dtype), (plan.rows,), plan.size)
         if name in plan.commands.normals:
             return plan.commands.normals[name], by_vehicle
-        own = name.replace(" ", "_")
-        own, shape = loops.same.get(own, (own, loops.shapes.get(own)))
-        if shape is None:
-            x = part_of(plan.commands.inputs, name)
-            x = x[:1] if x.dim() == 2 and len(x) == plan.many else x
-            array, by = operand(x, (plan.rows,), plan.size)
-            return array.astype(plan.real), by
         if loops.types[own] != plan.real:
             raise Untraceable(f"drivers who change lanes look at {name.removesuffix(' now')}")
-        wide = shape[-1] if shape else 1
+        wide = loops.shapes[own][0]
         return own, (0, wide, 0 if wide < plan.size else 1)
 
 
@@ -276,14 +278,33 @@ class LaneTransition(CompiledTransition):
 
     # -- forwards ------------------------------------------------------------------------------------------------
 
-    def begins(self, moment: Moment, now: Tensor, later: Tensor, tape: bool) -> tuple[int, ...]:
+    def until(self, clock: Array) -> int:
+        """Return the number of steps before the next one at which vehicles change lanes, come or go."""
+        every = self.task.simulator.decides_after
+        return int(((np.append(self._stages, 0)[:, None] - clock) % every).min())
+
+    def columns(self, moment: Moment, now: Tensor, begins: Array, later: Array) -> tuple[Array, ...]:
+        """Decide about lanes; return where worlds begin: before decisions, after them, and after each step."""
+        moment.begins = self.begins(moment, now, int(later[0]), True)
+        whole = moment.crossing.later
+        if moment.bound.by_record:
+            whole += [whole[0].copy() for _ in later[1:]]
+        else:
+            whole *= len(later)
+        after = np.array([address(x) for x in whole])
+        blocks, wholes = (
+            np.concatenate(([x], y)) for x, y in zip(moment.begins[2:4], (begins[1:], after[:-1]), strict=True)
+        )
+        return begins, np.concatenate((moment.begins[1:2], after[:-1])), blocks, wholes, later, after
+
+    def begins(self, moment: Moment, now: Tensor, later: int, tape: bool) -> tuple[int, ...]:
         """Decide about lanes; return where worlds begin: before it, after it, and after the step.
 
         Unordered, with nothing changed, where links are not the order of positions.
         """
         bound, whole = moment.bound, moment.whole
         assert isinstance(bound, LaneTables) and whole is not None
-        lanes = moment.crossing = Crossing(now, whole, whole)
+        lanes = moment.crossing = Crossing(now, whole, [])
         phase = moment.clock % self.task.simulator.decides_after
         if bound.recorded in self._turns:
             lanes.turned = np.flatnonzero(phase == 0)
@@ -300,9 +321,8 @@ class LaneTransition(CompiledTransition):
             if len(lanes.decided):
                 self._decide(moment, bound, phase[lanes.decided], begins)
                 self.settle.run(bound.still, lanes.decided, self._decision_inputs(moment), *after, *after)
-        by_record = any(n.startswith("then_links") for n in bound.recorded.forward.outs)
-        lanes.whole_later = lanes.whole_mid.copy() if by_record else lanes.whole_mid
-        return *begins, lanes.mid.data_ptr(), address(lanes.whole_mid), later.data_ptr(), address(lanes.whole_later)
+        lanes.later = [lanes.whole_mid.copy() if bound.by_record else lanes.whole_mid]
+        return *begins, lanes.mid.data_ptr(), address(lanes.whole_mid), later, address(lanes.later[0])
 
     def _decision_inputs(self, moment: Moment) -> dict[str, int]:
         """Return the addresses of what ``_settled`` is given beside worlds."""
@@ -337,8 +357,8 @@ class LaneTransition(CompiledTransition):
 
     # -- backwards -----------------------------------------------------------------------------------------------
 
-    def _first(self, moment: Moment, on_worlds: Array, on_parameters: Array) -> Array:
-        """Return what falls on the worlds before decisions; what falls on parameters there is added."""
+    def first(self, moment: Moment, on_worlds: Sequence[Array], on_parameters: Array) -> Array:
+        """Return the gradient of worlds before decisions, and add that of parameters in them."""
         bound, lanes, (on, between) = moment.bound, moment.crossing, on_worlds
         assert isinstance(bound, LaneTables)
         if len(lanes.decided):

@@ -17,6 +17,9 @@ from idm_env.envs.settings import Settings
 from idm_env.tasks import EnvState
 from idm_env.types import Params, worthwhile
 
+Maybe = Tensor | None
+Normals = Mapping[str, Tensor] | None
+
 
 class Moves:
     """The functions of a step, of what environments are made of."""
@@ -34,13 +37,7 @@ class Moves:
         return other
 
     def step(
-        self,
-        world: EnvState,
-        action: Tensor | None,
-        live: Tensor | None,
-        normals: Mapping[str, Tensor] | None,
-        driven: Params,
-        observed: bool = True,
+        self, world: EnvState, action: Maybe, live: Maybe, normals: Normals, driven: Params, observed: bool = True
     ) -> tuple[EnvState, dict[str, Tensor]]:
         """Return the worlds Δt later and all that faces tell of the step; ``driven`` are ``task.episode_params``.
 
@@ -54,12 +51,8 @@ class Moves:
         return after, self.told(world, command, limited, after, True, observed)
 
     def commanded(
-        self,
-        world: EnvState,
-        action: Tensor | None,
-        normals: Mapping[str, Tensor] | None = None,
-        live: Tensor | None = None,
-    ) -> tuple[Tensor | None, Tensor | None, Mapping[str, Any]]:
+        self, world: EnvState, action: Maybe, normals: Normals = None, live: Maybe = None
+    ) -> tuple[Maybe, Maybe, Mapping[str, Any]]:
         """Return commands, commands as the failsafe lets them pass, and the inputs of a step."""
         task = self.task
         command = None if action is None else task.command(action)
@@ -70,13 +63,7 @@ class Moves:
         return command, limited, inputs
 
     def told(
-        self,
-        before: EnvState,
-        command: Tensor,
-        given: Tensor | None,
-        after: EnvState,
-        commanded: bool,
-        observed: bool = True,
+        self, before: EnvState, command: Tensor, given: Maybe, after: EnvState, commanded: bool, observed: bool = True
     ) -> dict[str, Tensor]:
         """Return everything that faces tell of a step, by name."""
         task = self.task
@@ -104,9 +91,7 @@ class Moves:
             **{f"info_{name}": x for name, x in details.items()},
         }
 
-    def _details(
-        self, after: EnvState, command: Tensor | None, limited: Tensor | None, crashed: Tensor
-    ) -> dict[str, Tensor]:
+    def _details(self, after: EnvState, command: Maybe, limited: Maybe, crashed: Tensor) -> dict[str, Tensor]:
         """Return what infos tell of a step (``idm_env.envs.info``) and no more, shape ``(n, agents)`` each."""
         task, names, details = self.task, self._info, dict[str, Tensor]()
         if "accel" in names:

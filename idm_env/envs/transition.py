@@ -89,7 +89,7 @@ class WholeStep:
         self._by = [*flowing, *(n for n in ("action", "past") if n in inputs), *self.wanted]
         simulator = task.simulator
         self._stepper = Stepper(simulator.road, simulator.effects, simulator.dt, simulator.integration)
-        self.forward = RowFunction(self._step, inputs, many, apart=True, pitches=pitches)
+        self.forward = RowFunction(self._step, inputs, many, pitches=pitches)
         self.told = [n for n in self.forward.outs if not n.startswith("then_")]
 
     def _step(self, **leaves: Tensor) -> dict[str, Tensor]:
@@ -98,7 +98,7 @@ class WholeStep:
         if "past" in leaves:
             memory = {**world.state.memory, PAST: leaves["past"]}
             world = world._replace(state=world.state._replace(memory=memory))
-        mid = {n: leaves[f"mid_{n}"] for n in self.changing}
+        mid, task = {n: leaves[f"mid_{n}"] for n in self.changing}, self._moves.task
         driving = world_of({**leaves, **mid}, self._world).state if mid else world.state
 
         def drive(_: State, inputs: Any, params: Params) -> State:
@@ -113,6 +113,8 @@ class WholeStep:
         out |= {
             f"then_{n}": later[n] for n in self.changing[len(self._blocks) :] if storage(later[n]) != storage(mid[n])
         }
+        if task.journeys:
+            out["on_road"] = task.there(after.state, torch.ones_like(outputs["terminated"]))
         return out | ({"then_past": self._stepper.looked[0].now} if "past" in leaves else {})  # type: ignore[return-value]
 
     def refuse_chance(self, graph: bool) -> None:
@@ -162,7 +164,7 @@ class WholeStep:
                 to["to_past"] = carried if own is None else carried + own.movedim(1, -1)
             return to
 
-        return RowFunction(pulled, {**inputs, **seeds}, self.many, apart=True)
+        return RowFunction(pulled, {**inputs, **seeds}, self.many)
 
 
 class Tables:
@@ -292,15 +294,26 @@ class CompiledTransition:
         bound = moment.bound
         assert isinstance(bound, Tables)
         moment.given = self.pointers(moment)
-        moment.begins = self.begins(moment, now, later, tape)
+        moment.begins = self.begins(moment, now, later.data_ptr(), tape)
         self.split(bound.recorded.forward, bound.once.pointer(moment.given, moment.begins))
         if self.task.simulator.own and bool(later[bound.layout.blocks.index("state_speed")].isnan().any()):
             raise Untraceable("an effect returned nan: the step itself tells which")
         return bound.room.copied()
 
-    def begins(self, moment: Moment, now: Tensor, later: Tensor, tape: bool) -> tuple[int, ...]:
+    def begins(self, moment: Moment, now: Tensor, later: int, tape: bool) -> tuple[int, ...]:
         """Return where the worlds of a step begin (``before``), and those after it."""
-        return now.data_ptr(), later.data_ptr()
+        return now.data_ptr(), later
+
+    def until(self, clock: Array) -> int:
+        """Return the number of steps before the next one at which vehicles change lanes, come or go."""
+        return 1 << 40
+
+    def columns(self, moment: Moment, now: Tensor, begins: Array, later: Array) -> tuple[Array, ...]:
+        """Return where the worlds of some steps begin, and those after them; ``moment`` is the first of these steps.
+
+        ``now`` are the worlds before it, and no other one changes lanes.
+        """
+        return begins, later
 
     def split(self, loops: RowFunction, where: int) -> None:
         """Do the loops over all rows, with a table at an address, in some threads where there are many."""
@@ -357,10 +370,10 @@ class CompiledTransition:
         seeds = zeros if on_later is None else on_later.data_ptr()
         begins = *moment.begins[: len(self.before)], seeds, *(address(x) for x in on_worlds), address(on_parameters)
         self.split(bound.recorded.backward, bound.back.pointer(pointers, begins))
-        return self._first(moment, on_worlds, on_parameters), on_action, on_parameters, before
+        return self.first(moment, [*on_worlds], on_parameters), on_action, on_parameters, before
 
-    def _first(self, moment: Moment, on_worlds: Array, on_parameters: Array) -> Array:
-        """Return what falls on the first of the worlds that a step is computed from."""
+    def first(self, moment: Moment, on_worlds: Sequence[Array], on_parameters: Array) -> Array:
+        """Return the gradient of the first of the worlds that a step is computed from."""
         return on_worlds[0]
 
 

@@ -49,9 +49,9 @@ def unroll(
         hidden = _per_environment("hidden", hidden, (batch.count, *np.shape(hidden)[1:]))
     if hidden is not None and hidden.dtype != dtype:
         raise ValueError(f"hidden has {hidden.dtype}, and the environments have {dtype}. Give it in {dtype}.")
-    # On several lanes, and where actions are held, a window is its steps, each of which is compiled.
-    fits = task.held == 1 and task.road.outline is None and not task.simulator.untried
-    if fits and values is not None and dispatch.surroundings() is None:
+    # Detectors count every step: there a window is its steps, each of which is compiled.
+    counts = batch.counters is not None and bool(batch.counters.loops)
+    if not counts and not task.simulator.untried and values is not None and dispatch.surroundings() is None:
         from idm_env.envs import window
 
         try:

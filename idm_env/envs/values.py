@@ -137,6 +137,11 @@ class Values:
         """Cut the graph behind the worlds."""
         self.blocks, self._token, self._glance = self.blocks.detach(), None, None
 
+    @property
+    def whole(self) -> Array | None:
+        """Whole numbers ``(WHOLE, rows · vehicles)`` of all rows, as they are now, on a road of several lanes."""
+        return self._whole
+
     def clock(self) -> Tensor:
         """Return the steps of all rows, as they are now."""
         return torch.from_numpy(self._clock)
@@ -173,14 +178,15 @@ class Values:
                 outputs = {n: torch.from_numpy(x) for n, x in outputs.items()} | {"clock": clock}
         self._clock, self._glance = outputs.pop("clock"), None
         if moment.crossing is not None:
-            self._whole = moment.crossing.whole_later
+            self._whole = moment.crossing.later[0]
         if self.past.slots:
             self.past.newest -= 1
         return outputs
 
-    def arrive(self, blocks: Tensor, clock: Array, token: Tensor | None = None) -> None:
-        """Go on from other worlds of the same episodes."""
-        self.blocks, self._clock, self._token = blocks, clock, token
+    def arrive(self, blocks: Tensor, clock: Array, token: Tensor | None = None, whole: Array | None = None) -> None:
+        """Go on from other worlds of the same episodes; whole numbers stay, where there are no others."""
+        self.blocks, self._clock, self._token, self._glance = blocks, clock, token, None
+        self._whole = self._whole if whole is None else whole
 
     def token_of(self, plan: CompiledTransition) -> Tensor | None:
         """Return the token that stands for the past, if there is one."""
@@ -190,11 +196,13 @@ class Values:
 
     def mark(self) -> tuple[Any, ...]:
         """Return what ``back_to`` goes back to."""
-        return self.blocks, self._clock, self._token, self.layout, self.past, self.past.numbers, self.past.newest
+        past = self.past
+        return self.blocks, self._clock, self._whole, self._token, self.layout, past, past.numbers, past.newest
 
     def back_to(self, mark: tuple[Any, ...]) -> None:
         """Go back to the worlds as they were: steps have written nothing that these read."""
-        self.blocks, self._clock, self._token, self.layout, self.past, self.past.numbers, self.past.newest = mark
+        self.blocks, self._clock, self._whole, self._token, self.layout, self.past, *past = mark
+        (self.past.numbers, self.past.newest), self._glance = past, None
 
     def plan(self, kind: tuple[bool, bool], draws: tuple[str, ...], steps: int = 1) -> CompiledTransition:
         """Return the transition of a kind, made once; ``steps`` is how many of them are to be done.
@@ -278,47 +286,28 @@ def _twice(
     ctx: Any, blocks: Tensor, action: Tensor | None, token: Tensor | None, parameters: Sequence[Tensor],
     seeds: Sequence[Tensor | None],
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
-    """Return gradients with a graph of their own, for second derivatives, from the torch path."""
-    plan, moment = ctx.plan, ctx.moment
-    later, past, by_name = _again(plan, moment, blocks, action, token, moment.bound.with_values(parameters))
-    outputs = [later, past, *(by_name[n] for n in moment.bound.recorded.flowing)]
-    pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if o is not None and s is not None and o.requires_grad]
-    sources = [x for x in (blocks, action, token, *parameters) if x is not None and x.requires_grad]
-    gradients = iter(
-        torch.autograd.grad(
-            [o for o, _ in pairs], sources, [s for _, s in pairs], create_graph=True, allow_unused=True
-        )
-    )  # fmt: skip
-    return tuple(
-        next(gradients) if x is not None and x.requires_grad else None for x in (blocks, action, token, *parameters)
-    )  # fmt: skip
-
-
-def _again(
-    plan: CompiledTransition,
-    moment: Moment,
-    blocks: Tensor,
-    action: Tensor | None,
-    token: Tensor | None,
-    params: Params,
-) -> tuple[Tensor, Tensor | None, dict[str, Tensor]]:
-    """Do a step by torch: blocks and past Δt later and what is told, with a graph that can be differentiated."""
-    assert moment.bound is not None
-    layout, shape = moment.bound.layout, tuple(blocks.shape[1:])
-    past = _recent(moment, plan)
-    if past is not None and token is not None:
-        past = _Leave.apply(token, past)
+    """Return gradients with a graph of their own, for second derivatives: the step is done again by torch."""
+    plan, moment, shape = ctx.plan, ctx.moment, tuple(blocks.shape[1:])
+    layout, recorded = moment.bound.layout, moment.bound.recorded
+    past = None
+    if plan.past_shape:
+        recent = moment.past[:, moment.newest : moment.newest + plan.past_shape[1]]
+        past = torch.from_numpy(recent.copy()).movedim(-1, 1)
+        past = past if token is None else _Leave.apply(token, past)
     world = _world(plan.world, layout, blocks, moment.clock, past, moment.whole)
     live = None if moment.live is None else torch.from_numpy(moment.live).view(shape[0], -1)
-    normal_blocks = moment.normals
-    normals = (
-        None
-        if normal_blocks is None
-        else {n: torch.from_numpy(x).view(-1, *shape)[moment.at] for n, x in normal_blocks.items()}
-    )
-    after, outputs = plan.moves.step(world, action, live, normals, params)
+    normals = {n: torch.from_numpy(x).view(-1, *shape)[moment.at] for n, x in (moment.normals or {}).items()} or None
+    after, outcome = plan.moves.step(world, action, live, normals, moment.bound.with_values(parameters))
     last = after.state.memory.get(PAST)
-    return _block(after, layout.blocks), None if last is None else last.movedim(1, -1), outputs
+    outputs = [_block(after, layout.blocks), None if last is None else last.movedim(1, -1)]
+    outputs += [outcome[n] for n in recorded.flowing]
+    pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if o is not None and s is not None and o.requires_grad]
+    every = blocks, action, token, *parameters
+    differentiated = [x is not None and x.requires_grad for x in every]
+    sources: list[Any] = [x for x, flows in zip(every, differentiated, strict=True) if flows]
+    results, falls = zip(*pairs, strict=True)
+    gradients = iter(torch.autograd.grad(results, sources, falls, create_graph=True, allow_unused=True))
+    return tuple(next(gradients) if flows else None for flows in differentiated)
 
 
 def _world(
@@ -333,10 +322,8 @@ def _world(
         if name not in leaves:
             array = clock if name == "state_step" else layout.still[name]
             leaves[name] = torch.from_numpy(array).view(x.shape)
-    world = world_of(leaves, like)
-    return (
-        world if past is None else world._replace(state=world.state._replace(memory={**world.state.memory, PAST: past}))
-    )
+    state, episode = world_of(leaves, like)
+    return EnvState(state if past is None else state._replace(memory={**state.memory, PAST: past}), episode)
 
 
 def _block(world: EnvState, names: Sequence[str]) -> Tensor:
@@ -344,14 +331,6 @@ def _block(world: EnvState, names: Sequence[str]) -> Tensor:
     state = world.state
     leaves = named(world)
     return torch.stack([leaves[n].to(state.speed.dtype).expand(state.speed.shape) for n in names])
-
-
-def _recent(moment: Moment, plan: CompiledTransition) -> Tensor | None:
-    """Return the past that a step began with, as the state holds it."""
-    if not plan.past_shape:
-        return None
-    last = moment.past[:, moment.newest : moment.newest + plan.past_shape[1]]
-    return torch.from_numpy(last.copy()).movedim(-1, 1)
 
 
 def token_like(token: Tensor) -> Tensor:

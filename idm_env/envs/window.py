@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Mapping
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 from idm_env.envs.policy_call import NO_NUMBERS, policy_outputs
 from idm_env.envs.transition import CompiledTransition, Tables
 from idm_env.envs.values import token_like
-from idm_env.envs.worlds import Array, address
+from idm_env.envs.worlds import Array, Moment, address
 from idm_env.kernels import threads as pool
 from idm_env.kernels.policy_rows import PolicyRows
 from idm_env.kernels.rows import RowFunction, adjoint
@@ -35,62 +35,25 @@ _FEW, _MANY, _MOST = 3, 1009, 8
 
 
 class Driver:
-    """A policy as compiled loops: what it does, and the vector-Jacobian product of that.
+    """A policy as a function of its weights and its inputs, and as compiled loops: what it does, and the adjoint.
 
     ``memory`` is the shape of what it remembers of an environment, None where it remembers nothing.
 
     Raises:
         Untraceable: For a policy of other operations than those of small networks.
-        ValueError: For one that does not take these observations, or gives no actions.
     """
 
     def __init__(
-        self, policy: nn.Module, rows: int, width: int, actions: int, dtype: torch.dtype,
-        memory: tuple[int, ...] | None = None,
-    ) -> None:  # fmt: skip
-        recording = _Recording(policy, width, actions, dtype, memory)
-        with torch.no_grad():
-            policy_outputs(
-                policy, {n: torch.zeros(rows, *s, dtype=dtype) for n, s in recording.shapes.items()}, actions
-            )
-        self.names = recording.names
-        inputs = recording.inputs(_MANY)
-        shared = list(recording.sample)
-        try:
-            self.forward: PolicyRows = PolicyRows(recording.act, inputs, _MANY, shared)
-        except RuntimeError as error:  # it takes as many rows as there are environments, no more
-            raise Untraceable(str(error)) from error
-        self._pulled, self._inputs, self._shared = recording.pulled, recording.seeded(inputs), shared
-
-    @cached_property
-    def backward(self) -> PolicyRows:
-        """The vector-Jacobian product of the recorded policy."""
-        return PolicyRows(self._pulled, self._inputs, _MANY, self._shared)
-
-    def weights(self, policy: nn.Module) -> dict[str, Tensor]:
-        """Return the policy's weights and buffers as they are now, by their short names."""
-        own = _own(policy)
-        return {short: own[n] for n, short in self.names.items()}
-
-
-def _own(policy: nn.Module) -> dict[str, Tensor]:
-    return {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
-
-
-class _Recording:
-    """A policy as a function of its weights and its inputs, to be recorded; and its adjoint."""
-
-    def __init__(
-        self, policy: nn.Module, width: int, actions: int, dtype: torch.dtype, memory: tuple[int, ...] | None
+        self, policy: nn.Module, width: int, actions: int, dtype: torch.dtype, memory: tuple[int, ...] | None = None
     ) -> None:
         own = _own(policy)
         if any(x.dtype != dtype or not x.is_contiguous() for x in own.values()):
             raise Untraceable("a policy in another precision than the environment")
         names = self.names = dict(zip(own, (f"w{i}" for i in range(len(own))), strict=True))
         learned = [names[n] for n, _ in policy.named_parameters()]
-        self.sample = {names[n]: x.detach().clone() for n, x in own.items()}
-        self.dtype, self.actions = dtype, actions
-        shapes = self.shapes = {"seen": (width,), **({} if memory is None else {"hidden": memory})}
+        self._sample = {names[n]: x.detach().clone() for n, x in own.items()}
+        self._dtype, self._actions = dtype, actions
+        shapes = self._shapes = {"seen": (width,), **({} if memory is None else {"hidden": memory})}
 
         def act(**given: Tensor) -> dict[str, Tensor]:
             weights = {n: given[short] for n, short in names.items()}
@@ -103,23 +66,51 @@ class _Recording:
         def pulled(**given: Tensor) -> dict[str, Tensor]:
             return {f"to_{n}": x for n, x in back(**given).items()}
 
-        self.act, self.pulled = act, pulled
+        self._act, self._pulled = act, pulled
 
-    def inputs(self, rows: int) -> dict[str, Tensor]:
-        """Return examples of the policy's inputs."""
-        shapes = {**self.shapes, "push": (self.actions,)}
-        return {n: torch.zeros(rows, *shape, dtype=self.dtype) for n, shape in shapes.items()} | self.sample
-
-    def seeded(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return examples of its adjoint's inputs."""
+    def check(self, policy: nn.Module, rows: int) -> None:
+        """Call the policy once; ValueError for one that does not take these observations, or gives no actions."""
+        blank = {n: torch.zeros(rows, *shape, dtype=self._dtype) for n, shape in self._shapes.items()}
         with torch.no_grad():
-            return {**inputs, **{f"on_{n}": torch.zeros_like(x) for n, x in self.act(**inputs).items()}}
+            policy_outputs(policy, blank, self._actions)
+
+    def _inputs(self, rows: int) -> dict[str, Tensor]:
+        shapes = {**self._shapes, "push": (self._actions,)}
+        return {n: torch.zeros(rows, *shape, dtype=self._dtype) for n, shape in shapes.items()} | self._sample
+
+    def _seeded(self, rows: int) -> dict[str, Tensor]:
+        """Return examples of the adjoint's inputs."""
+        inputs = self._inputs(rows)
+        with torch.no_grad():
+            return {**inputs, **{f"on_{n}": torch.zeros_like(x) for n, x in self._act(**inputs).items()}}
+
+    @cached_property
+    def forward(self) -> PolicyRows:
+        """The loops of the policy. Untraceable also for one that takes as many rows as there are environments only."""
+        try:
+            return PolicyRows(self._act, self._inputs(_MANY), _MANY, list(self._sample))
+        except RuntimeError as error:
+            raise Untraceable(str(error)) from error
+
+    @cached_property
+    def backward(self) -> PolicyRows:
+        """The vector-Jacobian product of the recorded policy."""
+        return PolicyRows(self._pulled, self._seeded(_MANY), _MANY, list(self._sample))
+
+    def weights(self, policy: nn.Module) -> dict[str, Tensor]:
+        """Return the policy's weights and buffers as they are now, by their short names."""
+        own = _own(policy)
+        return {short: own[n] for n, short in self.names.items()}
 
     def digest(self) -> bytes:
         """Return the digest of all operations of the policy as it is now, of its adjoint, too."""
-        inputs, graph = self.inputs(_FEW), torch.is_grad_enabled()
-        forwards = digest(self.act, inputs, PolicyRows.simpler, gradients=graph)
-        return forwards + (digest(self.pulled, self.seeded(inputs), PolicyRows.simpler) if graph else b"")
+        graph = torch.is_grad_enabled()
+        forwards = digest(self._act, self._inputs(_FEW), PolicyRows.simpler, gradients=graph)
+        return forwards + (digest(self._pulled, self._seeded(_FEW), PolicyRows.simpler) if graph else b"")
+
+
+def _own(policy: nn.Module) -> dict[str, Tensor]:
+    return {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
 
 
 _DRIVERS: weakref.WeakKeyDictionary[nn.Module, dict[Any, Driver | None]] = weakref.WeakKeyDictionary()
@@ -141,16 +132,16 @@ def driver_of(policy: Any, seen: Tensor, actions: int, hidden: Tensor | None = N
     if form in drivers:
         return None
     try:
-        key = (form, _Recording(policy, width, actions, dtype, memory).digest())
+        driver = Driver(policy, width, actions, dtype, memory)
+        key = (form, driver.digest())
         if key in drivers:
             return drivers[key]
         while len(drivers) >= _MOST:
             del drivers[next(iter(drivers))]
         drivers[key] = None
-        driver = Driver(policy, rows, width, actions, dtype, memory)
-        if graph:
-            _ = driver.backward
-        if _Recording(policy, width, actions, dtype, memory).digest() != key[1]:
+        driver.check(policy, rows)
+        _ = driver.forward, graph and driver.backward
+        if driver.digest() != key[1]:
             drivers[form] = None  # it changes by being called
             return None
         drivers[key] = driver
@@ -162,22 +153,26 @@ def driver_of(policy: Any, seen: Tensor, actions: int, hidden: Tensor | None = N
 
 
 class _Segment(NamedTuple):
-    """Steps ``first`` to ``last`` between two resets, or two blocks of normals: what held for them."""
+    """Steps ``first`` to ``last`` of which only the first may change lanes, or be behind a reset: what held for them.
+
+    ``begins`` is where worlds begin from which steps are computed.
+    """
 
     first: int
     last: int
-    bound: Tables
-    given: dict[str, Any]
+    moment: Moment
+    begins: tuple[Array, ...]
+    pointers: dict[str, Array]
 
 
-def _each(x: Array, part: slice) -> Array:
-    """Return the addresses of what an array holds for some steps."""
-    return address(x) + np.arange(part.start, part.stop, dtype=np.int64) * (x.nbytes // len(x))
+def _each(x: Array, numbers: Array) -> Array:
+    """Return the addresses of some elements of an array, by their numbers."""
+    return address(x) + numbers * (x.nbytes // len(x))
 
 
-def _columns(loops: RowFunction, pointers: Mapping[str, Any], part: slice) -> Array:
+def _columns(loops: RowFunction, pointers: Mapping[str, Any], steps: int) -> Array:
     """Return tables of the loops of a policy, one for each step."""
-    columns = np.empty((part.stop - part.start, len(loops.table({}))), np.int64)
+    columns = np.empty((steps, len(loops.table({}))), np.int64)
     columns[:] = loops.table({})
     for name in (*loops.needs, *loops.outs, *getattr(loops, "sums", ())):
         columns[:, loops.place(name)] = pointers[name]
@@ -185,150 +180,199 @@ def _columns(loops: RowFunction, pointers: Mapping[str, Any], part: slice) -> Ar
 
 
 class Tape:
-    """What a window keeps: worlds before and after every step, and what was seen, remembered, done and returned.
+    """The memory of a window: worlds, observations, hidden numbers, actions and outputs of every Δt.
 
-    Everything else is computed once more backwards.
+    Everything else is computed once more backwards. Each of ``actions`` is held for ``held`` steps of Δt.
     """
 
     def __init__(
-        self, plan: CompiledTransition, bound: Tables, driver: Driver, steps: int, blocks: Tensor, seen: Tensor,
+        self, plan: CompiledTransition, bound: Tables, driver: Driver, actions: int, blocks: Tensor, seen: Tensor,
         hidden: Tensor, push: Tensor,
     ) -> None:  # fmt: skip
-        self.plan, self.driver, self.steps = plan, driver, steps
-        rows, kind = plan.rows, plan.real
+        held = self.held = plan.task.held
+        self.plan, self.driver, self.actions, self.steps = plan, driver, actions, actions * held
+        rows, kind, steps = plan.rows, plan.real, self.steps
         self.worlds = torch.from_numpy(np.empty((steps, *blocks.shape), kind))  # numpy asks for large pages
-        self.held: list[Any] = [blocks, push]
+        self.held_memory: list[Any] = [blocks, push]
         self.outputs = bound.room.take(steps)
-        self.seen = np.empty((steps + 1, seen.numel()), kind)
+        self.seen = np.empty((actions + 1, seen.numel()), kind)
         self.seen[0] = seen.reshape(-1).numpy()
-        self.hidden = np.empty((steps + 1, hidden.numel()), kind)
+        self.hidden = np.empty((actions + 1, hidden.numel()), kind)
         self.hidden[0] = hidden.reshape(-1).numpy()
         self.final = self.outputs["observation"].reshape(steps, -1)
         self.push = push.numpy()
-        self.action = np.empty((steps, push.numel()), kind)
+        self.action = np.empty((actions, push.numel()), kind)
         self.later = self.worlds.data_ptr() + np.arange(steps, dtype=np.int64) * blocks.numel() * blocks.element_size()
         self.now = np.concatenate(([blocks.data_ptr()], self.later[:-1]))
         self.clocks = np.empty((steps + 1, rows), np.int64)
+        self.on_road = np.empty((steps + 1, rows * len(plan.task.agents)), np.bool_)
         self.ends, self.cuts = (self.outputs[f"whole_{n}"].reshape(steps, rows) for n in ("terminated", "truncated"))
         self.segments: list[_Segment] = []
         self._blocks = -(-rows // BLOCK)
         self._threads = 1 if plan.count * AHEAD < 2 * pool.GRAIN else pool.count(plan.count * AHEAD)
 
-    def given(self, part: slice, batch: Batch, values: Values) -> dict[str, Any]:
-        """Return the addresses of what steps are given beside their worlds."""
-        plan, past, count = self.plan, values.past, np.arange(part.stop - part.start, dtype=np.int64)
+    def pointers(self, steps: Array, batch: Batch, values: Values) -> dict[str, Array]:
+        """Return the addresses of the inputs of steps, beside their worlds."""
+        plan, past, count, decided = self.plan, values.past, steps - steps[0], steps // self.held
         _, normals = batch.ahead()
-        self.held += [normals, past.numbers]
-        pointers: dict[str, Any] = {
+        self.held_memory += [normals, past.numbers]
+        pointers: dict[str, Array] = {
             f"normal_{n}": address(x) + (batch.used + count) * plan.pitch for n, x in (normals or {}).items()
         }
         if past.slots:
             pointers["past"] = address(past.numbers) + (past.newest - count) * plan.slot
             pointers["then_past"] = pointers["past"] - plan.slot
-        return pointers | {"action": _each(self.action, part), "state_step": _each(self.clocks, part)}
+        pointers["live"] = _each(self.on_road, decided * self.held)
+        return pointers | {"action": _each(self.action, decided), "state_step": _each(self.clocks, steps)}
 
     def run(self, batch: Batch, values: Values, weights: Mapping[str, Array]) -> None:
-        """Do all steps; episodes that end begin anew."""
-        plan, done = self.plan, 0
+        """Do all steps; episodes that end begin anew with the next action."""
+        plan, held, done = self.plan, self.held, 0
+        decides = {"seen": self.seen, "hidden": self.hidden, "later": self.hidden[1:]}
         self.clocks[0] = values.clock().numpy()
+        self.on_road[0] = batch.on_road().reshape(-1)
         while done < self.steps:
-            ahead = batch.ahead()[0]
-            part = slice(
-                done, min(self.steps, done + ahead, done + (values.past.room() if values.past.slots else ahead))
-            )
-            bound = plan.of(values.layout, batch.episode_params())
-            pointers, worlds = self.given(part, batch, values), (self.now[part], self.later[part])
-            to = (
-                pointers
-                | {n: _each(x, part) for n, x in self.outputs.items()}
-                | {"clock": _each(self.clocks[1:], part)}
-            )
-            own = {"seen": _each(self.seen, part), "push": address(self.push), "action": pointers["action"]}
-            own |= {"hidden": _each(self.hidden, part), "later": _each(self.hidden[1:], part)}
-            own |= {n: address(x) for n, x in weights.items()}
-            tables = _columns(self.driver.forward, own, part), bound.ahead.filled(to, *worlds)
-            count = self._ahead(bound, *tables, part)
-            self.segments.append(_Segment(done, done + count, bound, {n: x[:count] for n, x in pointers.items()}))
+            ahead = min(batch.ahead()[0], 1 + plan.until(self.clocks[done] + 1))
+            ahead = min(ahead, values.past.room()) if values.past.slots else ahead
+            # Whoever ends begins anew after the action.
+            ahead = min(ahead, held - done % held) if done % held else ahead
+            part = slice(done, min(self.steps, done + ahead))
+            steps = np.arange(part.start, part.stop, dtype=np.int64)
+            bound, pointers = plan.of(values.layout, batch.episode_params()), self.pointers(steps, batch, values)
+            own: dict[str, Any] = {n: _each(x, steps // held) for n, x in decides.items()}
+            own |= {n: address(x) for n, x in weights.items()} | {"push": address(self.push)} | pointers
+            acts = _columns(self.driver.forward, own, len(steps))
+            moment = Moment(self.clocks[done], None, None, None, 0, values.past.numbers, 0, bound, values.whole)
+            moment.given = {n: int(x[0]) for n, x in pointers.items()}
+            if done % held == 0 and plan.until(moment.clock) == 0:
+                self.driver.forward.run(0, plan.rows, address(acts))
+            worlds = plan.columns(moment, values.blocks, self.now[part], self.later[part])
+            to = pointers | {n: _each(x, steps) for n, x in self.outputs.items()}
+            to |= {"clock": _each(self.clocks[1:], steps), "on_road": _each(self.on_road[1:], steps)}
+            count = self._ahead(bound, acts, bound.ahead.filled(to, *worlds), part)
+            self.segments.append(_Segment(done, done + count, moment, worlds[: len(plan.before)], pointers))
             batch.used += count
             values.past.newest -= count if values.past.slots else 0
             done += count
-            values.arrive(self.worlds[done - 1], self.clocks[done].copy())
-            over = np.flatnonzero(self.ends[done - 1] | self.cuts[done - 1])
+            whole = moment.crossing.later[count - 1] if moment.crossing else None
+            values.arrive(self.worlds[done - 1], self.clocks[done].copy(), whole=whole)
             batch.saw(torch.from_numpy(self.outputs["observation"][done - 1].copy()))
-            if len(over):
-                fresh = batch.reset(over)
-                batch.settle()
-                self.seen[done] = fresh.reshape(-1).numpy()  # type: ignore[union-attr]
-                self.hidden[done].reshape(plan.rows, -1)[over] = 0.0
-                self.held.append(values.blocks)
-                if done < self.steps:
-                    self.now[done] = values.blocks.data_ptr()
-                self.clocks[done] = values.clock().numpy()
+            if done % held == 0:
+                self._reset(batch, values, done)
+        self._count()
+
+    def _reset(self, batch: Batch, values: Values, done: int) -> None:
+        """Begin anew where an episode has ended within the last action."""
+        last = slice(done - self.held, done)
+        over = np.flatnonzero((self.ends[last] | self.cuts[last]).any(0))
+        if len(over):
+            fresh = batch.reset(over)
+            batch.settle()
+            action = done // self.held
+            self.seen[action] = fresh.reshape(-1).numpy()  # type: ignore[union-attr]
+            self.hidden[action].reshape(self.plan.rows, -1)[over] = 0.0
+            self.held_memory.append(values.blocks)
+            if done < self.steps:
+                self.now[done] = values.blocks.data_ptr()
+            self.clocks[done] = values.clock().numpy()
+            self.on_road[done] = batch.on_road().reshape(-1)
 
     def _ahead(self, bound: Tables, acts: Array, asks: Array, part: slice) -> int:
         """Do some steps of all blocks, or until somebody's episode is over; return how many."""
-        done, last, plan = 0, part.stop - part.start, self.plan
-        arrays = self.seen[part.start :], self.final[part], self.ends[part], self.cuts[part]
-        loops = self.driver.forward.call, acts, bound.recorded.forward.call, asks, plan.rows
+        done, last, held, (action, odd) = 0, part.stop - part.start, self.held, divmod(part.start, self.held)
+        arrays = self.seen[action:], self.final[part], self.ends[part], self.cuts[part]
+        loops = self.driver.forward.call, acts, bound.recorded.forward.call, asks, self.plan.rows, held, odd
         while done < last:
-            stops, until = list[int](), last if self._blocks == 1 else min(done + AHEAD, last)
+            whole_actions = (odd + done + max(AHEAD, held)) // held * held - odd
+            stops, until = list[int](), last if self._blocks == 1 else min(whole_actions, last)
 
             def some(begin: int, end: int, first: int = done, last: int = until, stops: list[int] = stops) -> None:
                 stops.append(window(*loops, begin, end, first, last, *arrays))
 
             pool.split(some, self._blocks, 1, self._threads)
             done = min(stops)
-            if done < until or (self.ends[part.start + done - 1] | self.cuts[part.start + done - 1]).any():
+            recent = slice((part.start + done - 1) // held * held, part.start + done)
+            if done < until or (self.ends[recent] | self.cuts[recent]).any():
                 break
         return done
 
+    def _count(self) -> None:
+        """Say whose episode has ended since an action began, which steps count, and the last one that does.
+
+        Steps after the end of an episode, until the next action, do not count.
+        """
+        over = (self.ends | self.cuts).reshape(self.actions, self.held, -1)
+        over = np.logical_or.accumulate(over, axis=1)
+        self.over, self.counts = over.reshape(self.steps, -1), np.ones_like(over)
+        self.counts[:, 1:] = ~over[:, :-1]
+        self.tells = np.arange(self.actions)[:, None] * self.held + self.counts.sum(1) - 1
+
+    def last(self, name: str) -> Array:
+        """Return an output of the last step of every action that counts: ``(actions, rows, …)``."""
+        x, rows = self.outputs[name], np.arange(self.plan.rows)
+        return x.reshape(self.steps, len(rows), -1)[self.tells, rows]
+
+    def reward(self) -> Array:
+        """Return the sum of the rewards of every action ``(actions, rows)``."""
+        parts = self.outputs["whole_reward"].reshape(self.counts.shape)
+        return reduce(np.add, (parts * self.counts).swapaxes(0, 1))
+
     def back(
-        self, weights: Mapping[str, Array], on_seen: Array, on_last: Array, on_action: Array, on_reward: Array,
+        self, weights: Mapping[str, Array], on_seen: Array, on_final: Array, on_action: Array, on_reward: Array,
         on_worlds: Array, on_past: Array, on_hidden: Array,
     ) -> tuple[Array, Array, Array, Array, dict[str, Array]]:  # fmt: skip
-        """Return what falls on first worlds, the past then, parameters, actions (every step), and sums of weights."""
-        plan, driver, steps = self.plan, self.driver, self.steps
+        """Return what falls on first worlds, the past then, parameters, actions, and sums of weights."""
+        plan, driver, steps, held = self.plan, self.driver, self.steps, self.held
         two, pasts = np.zeros((2, *on_worlds.shape), plan.real), np.zeros((2, *on_past.shape), plan.real)
         two[steps % 2], pasts[steps % 2] = on_worlds, on_past
-        parameters, each = np.zeros((2, len(self.segments[0].bound.wanted), plan.count), plan.real)
-        acted = np.zeros_like(self.action)
+        mid = np.empty((len(plan.worlds) - 1, *on_worlds.shape), plan.real)
+        parameters, each = np.zeros((2, len(self.segments[0].moment.bound.wanted), plan.count), plan.real)
+        acted, done = np.zeros_like(self.action), np.zeros(self.action.shape[1], plan.real)
         on_observation, looked = np.zeros((2, self.seen.shape[1]), plan.real)
-        total, recalled, on_later = on_seen[steps].copy(), on_hidden.copy(), np.empty_like(on_hidden)
+        on_last = on_final if held == 1 else np.zeros(self.final.shape, plan.real)
+        if held > 1:
+            rows = np.arange(plan.rows)
+            on_last.reshape(steps, plan.rows, -1)[self.tells, rows] = on_final.reshape(self.actions, plan.rows, -1)
+        on_reward = (on_reward[:, None] * self.counts).reshape(steps, -1)
+        total, recalled, on_later = on_seen[-1].copy(), on_hidden.copy(), np.empty_like(on_hidden)
         threads = min(self._threads, self._blocks)
         sums = [{n: np.zeros(size, plan.real) for n, size in driver.backward.sums.items()} for _ in range(threads)]
         remembers = "to_hidden" in driver.backward.outs
-        for segment in reversed(self.segments):
-            part, recorded = slice(segment.first, segment.last), segment.bound.recorded
-            side = np.arange(part.start, part.stop) % 2
-            falls = {f"on_{n}": address(plan.zeros) for n in recorded.flowing} | segment.given
-            falls |= {"on_observation": address(on_observation), "on_whole_reward": _each(on_reward, part)}
-            falls |= {"to_action": _each(acted, part)}
+        for first, last, moment, before, pointers in reversed(self.segments):
+            recorded, numbers = moment.bound.recorded, np.arange(first, last)
+            side = numbers % 2
+            falls: dict[str, Any] = {f"on_{n}": address(plan.zeros) for n in recorded.flowing}
+            falls |= {n: x[: last - first] for n, x in pointers.items()}
+            falls |= {"on_observation": address(on_observation), "on_whole_reward": _each(on_reward, numbers)}
+            falls |= {"to_action": address(done)}
             falls |= {"on_past": address(pasts[0]) + (1 - side) * pasts[0].nbytes}
             falls |= {"to_past": address(pasts[0]) + side * pasts[0].nbytes}
             begins, seeds = (address(two) + k * two[0].nbytes for k in (side, 1 - side))
-            worlds = self.now[part], seeds, begins, np.full(len(side), address(each))
-            asks = segment.bound.back.filled(falls, *worlds)
-            see = {"seen": _each(self.seen, part), "push": address(self.push), "on_action": falls["to_action"]}
+            constant = (np.full(len(side), address(x)) for x in (*mid, each))
+            asks = moment.bound.back.filled(falls, *(x[: last - first] for x in before), seeds, begins, *constant)
+            see = {"seen": _each(self.seen, numbers // held), "push": address(self.push)}
+            see |= {"on_action": _each(acted, numbers // held), "hidden": _each(self.hidden, numbers // held)}
             see |= {n: address(x) for n, x in weights.items()} | {"to_seen": address(looked)}
-            see |= {"hidden": _each(self.hidden, part), "on_later": address(on_later), "to_hidden": address(recalled)}
-            shared = recorded.backward.call, asks, plan.rows, plan.size
+            see |= {"on_later": address(on_later), "to_hidden": address(recalled)}
+            shared = recorded.backward.call, asks, plan.rows, plan.size, held
             arrays = (
-                segment.first % 2, segment.last - segment.first, self.ends[part], self.cuts[part], two, pasts,
-                on_seen[part], on_last[part], on_action[part], acted[part], on_observation, looked, total, recalled,
-                on_later, remembers, each, parameters,
+                first, last - first, self.over[first:last], two, mid, pasts, on_seen, on_last[first:last], on_action,
+                acted, done, on_observation, looked, total, recalled, on_later, remembers, each, parameters,
             )  # fmt: skip
-            some = partial(_rows_back, driver.backward, list(sums), see, part, shared, arrays)
+            some = partial(_rows_back, driver.backward, list(sums), see, shared, arrays)
             pool.split(some, self._blocks, 1, threads)
+            if len(mid):
+                two[first % 2] = plan.first(moment, (two[first % 2], *mid), parameters)
         summed = {n: sum((x[n] for x in sums[1:]), sums[0][n]) for n in sums[0]}
         return two[0], pasts[0], parameters, acted, {**summed, "seen": total, "hidden": recalled}
 
 
 def _rows_back(
-    loops: PolicyRows, free: list[Any], see: Mapping[str, Any], part: slice, shared: Any, arrays: Any, *span: int
+    loops: PolicyRows, free: list[Any], see: Mapping[str, Any], shared: Any, arrays: Any, *span: int
 ) -> None:
     """Go back over a span of blocks with sums that no other thread has taken."""
     own = {n: address(x) for n, x in free.pop().items()}
-    window_back(loops.call, _columns(loops, {**see, **own}, part), *shared, *span, *arrays)
+    window_back(loops.call, _columns(loops, {**see, **own}, arrays[1]), *shared, *span, *arrays)
 
 
 class _Window(torch.autograd.Function):
@@ -342,17 +386,16 @@ class _Window(torch.autograd.Function):
         for name, x in (("actions", tape.action), ("hidden numbers", tape.hidden)):
             if not np.isfinite(x).all():
                 raise ValueError(NO_NUMBERS.format(name))
-        rows, steps = tape.plan.rows, tape.steps
-        parameters = [x for _, x in tape.segments[0].bound.wanted]
+        rows, actions = tape.plan.rows, tape.actions
+        parameters = [x for _, x in tape.segments[0].moment.bound.wanted]
         ctx.tape, ctx.names, ctx.shapes = tape, names, [x.shape for x in parameters]
         ctx.save_for_backward(blocks, seen, hidden, push, *given)
         ctx.set_materialize_grads(False)
-        shaped = (steps, rows, -1)
         return (
             values.blocks.clone(), None if token is None else token_like(token),
-            torch.from_numpy(tape.seen).view(steps + 1, rows, -1), torch.from_numpy(tape.action).view(shaped),
-            torch.from_numpy(tape.outputs["whole_reward"]).view(steps, rows), torch.from_numpy(tape.final).view(shaped),
-            torch.from_numpy(tape.hidden[-1]).view(hidden.shape),
+            torch.from_numpy(tape.seen).view(actions + 1, rows, -1),
+            torch.from_numpy(tape.action).view(actions, rows, -1), torch.from_numpy(tape.reward()),
+            torch.from_numpy(tape.last("observation")), torch.from_numpy(tape.hidden[-1]).view(hidden.shape),
         )  # fmt: skip
 
     @staticmethod
@@ -365,10 +408,10 @@ class _Window(torch.autograd.Function):
         def dense(x: Tensor | None, *shape: int) -> Array:
             return np.zeros(shape, plan.real) if x is None else np.ascontiguousarray(x.numpy()).reshape(shape)
 
-        steps, wide, acts = tape.steps, tape.seen.shape[1], tape.action.shape[1]
+        actions, wide, acts = tape.actions, tape.seen.shape[1], tape.action.shape[1]
         on_now, on_past, on_parameters, acted, sums = tape.back(
-            weights, dense(on[2], steps + 1, wide), dense(on[5], steps, wide), dense(on[3], steps, acts),
-            dense(on[4], steps, plan.rows), dense(on[0], len(blocks), plan.count),
+            weights, dense(on[2], actions + 1, wide), dense(on[5], actions, wide), dense(on[3], actions, acts),
+            dense(on[4], actions, plan.rows), dense(on[0], len(blocks), plan.count),
             dense(on[1], *(plan.past_shape or (plan.rows, 1, 1, 1))),
             dense(on[6], hidden.numel()),
         )  # fmt: skip
@@ -384,7 +427,7 @@ class _Window(torch.autograd.Function):
                 continue
             array, shape, strides, offset = summed[f"to_{name}"]
             gradients.append(torch.from_numpy(sums[array]).as_strided(shape, strides, offset).reshape(x.shape))
-        for (i, x), shape in zip(tape.segments[0].bound.wanted, ctx.shapes, strict=True):
+        for (i, x), shape in zip(tape.segments[0].moment.bound.wanted, ctx.shapes, strict=True):
             gradients.append(torch.from_numpy(on_parameters[i]).view(blocks.shape[1:]).sum_to_size(shape).to(x.dtype))
         return (None,) * 4 + tuple(gradients)
 
@@ -397,7 +440,7 @@ def compiled(
     driver = driver_of(policy, seen, push.shape[-1], hidden)
     if driver is None:
         return None
-    plan = values.plan((False, True), batch.task.simulator.draws, steps)
+    plan = values.plan((False, not batch.task.journeys), batch.task.simulator.draws, steps)
     first = values.blocks
     begun = seen.new_zeros(len(seen), 0) if hidden is None else hidden
     bound = plan.of(values.layout, batch.episode_params())
@@ -412,7 +455,6 @@ def compiled(
         batch.back_to(mark)
         raise
     values.arrive(out[0], values.clock().numpy(), out[1])
-    rows = plan.rows
-    batch.saw(out[2][-1].view(rows, len(batch.task.agents), -1))
-    ends, cuts = (torch.from_numpy(x.copy()) for x in (tape.ends, tape.cuts))
+    batch.saw(out[2][-1])
+    ends, cuts = (torch.from_numpy(tape.last(f"whole_{n}")[..., 0]) for n in ("terminated", "truncated"))
     return (out[2], out[3], out[4], ends, cuts, out[5], None if hidden is None else out[6])

@@ -7,7 +7,7 @@ bits with and without a graph. It imports numba only once a kernel is to run.
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -86,8 +86,7 @@ def _unfit_tensors(state: State, inputs: Inputs, params: Params) -> str | None:
     if state.speed.numel() == 0:
         return "there are no vehicles"
     shape = state.speed.shape
-    memories = [x for name, x in state.memory.items() if name != PAST]
-    for x in memories:
+    for x in (x for name, x in state.memory.items() if name != PAST):
         if not _within(x.shape, shape):
             return f"a memory has shape {tuple(x.shape)}; kernels know one number per vehicle"
     tensors = [state.position, state.speed, state.gap, *state.memory.values(), *_tensors(inputs)]
@@ -117,11 +116,8 @@ def _within(shape: torch.Size, full: torch.Size) -> bool:
 
 
 def _tensors(inputs: Inputs) -> list[Tensor]:
-    leaves: list[Tensor] = []
-    for value in inputs.values():
-        parts: Any = (value,) if isinstance(value, Tensor) else value
-        leaves += [x for x in parts if x is not None]
-    return leaves
+    parts = ((value,) if isinstance(value, Tensor) else value for value in inputs.values())
+    return [x for part in parts for x in part if x is not None]
 
 
 __all__ = ["found", "off", "refusal", "rollout", "surroundings"]

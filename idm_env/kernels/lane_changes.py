@@ -76,6 +76,7 @@ class Traffic:
         self.n = self.shape[-1]
         self.rows = state.speed.numel() // self.n
         self._take(state.lanes)
+        self._ring = float(self.road.ring or 0.0)
         self._lasting: _Lasting | None = None
         self._order: tuple[Array, Array] | None = None
 
@@ -103,10 +104,6 @@ class Traffic:
             state = turnover(self.simulator, state._replace(lanes=self.lanes), params)
             self._take(state.lanes)
         return state
-
-    @cached_property
-    def _ring(self) -> float:
-        return self.road.ring or 0.0
 
     def _present(self, state: State) -> tuple[Array, bool]:
         if state.present is None:

@@ -74,14 +74,19 @@ def number(typing_context: Any, place: Any, index: Any, like: Any) -> Any:
     return kind(place, types.int64, like), generate
 
 
+def _ends(context: Any, builder: Any, target: Any, source: Any, arguments: Sequence[Any], kind: Any) -> tuple[Any, Any]:
+    """Return the pointers to the first numbers that are written and read."""
+    first = _pointer(context, builder, target, arguments[0], arguments[1], kind)
+    return first, _pointer(context, builder, source, arguments[2], arguments[3], kind)
+
+
 @intrinsic
 def copy(typing_context: Any, target: Any, to: Any, source: Any, at: Any, n: Any) -> Any:
     """Copy ``n`` numbers from index ``at`` of one place to index ``to`` of another, which do not overlap."""
     kind = _number(target, source)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        first = _pointer(context, builder, target, arguments[0], arguments[1], kind)
-        second = _pointer(context, builder, source, arguments[2], arguments[3], kind)
+        first, second = _ends(context, builder, target, source, arguments, kind)
         cgutils.raw_memcpy(builder, first, second, arguments[4], _bytes(context, kind).constant)
         return context.get_dummy_value()
 
@@ -93,8 +98,7 @@ def stream(typing_context: Any, target: Any, to: Any, source: Any, at: Any) -> A
     """Copy a cache line past the caches to an address where one begins, from an array."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        first = _pointer(context, builder, target, arguments[0], arguments[1], source.dtype)
-        second = _pointer(context, builder, source, arguments[2], arguments[3], source.dtype)
+        first, second = _ends(context, builder, target, source, arguments, source.dtype)
         line = ir.VectorType(ir.IntType(32), LINE // 4).as_pointer()
         content = builder.load(builder.bitcast(second, line), align=4)
         done = builder.store(content, builder.bitcast(first, line), align=LINE)
@@ -110,8 +114,7 @@ def add(typing_context: Any, target: Any, to: Any, source: Any, at: Any, n: Any)
     kind = _number(target, source)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        first = _pointer(context, builder, target, arguments[0], arguments[1], kind)
-        second = _pointer(context, builder, source, arguments[2], arguments[3], kind)
+        first, second = _ends(context, builder, target, source, arguments, kind)
         with cgutils.for_range(builder, arguments[4]) as loop:
             cell = builder.gep(first, [loop.index])
             builder.store(builder.fadd(builder.load(cell), builder.load(builder.gep(second, [loop.index]))), cell)
@@ -126,8 +129,7 @@ def gather(typing_context: Any, target: Any, to: Any, source: Any, at: Any, inde
     kind = _number(target, source)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        into = _pointer(context, builder, target, arguments[0], arguments[1], kind)
-        base = _pointer(context, builder, source, arguments[2], arguments[3], kind)
+        into, base = _ends(context, builder, target, source, arguments, kind)
         which = _pointer(context, builder, index, arguments[4], arguments[5], index.dtype)
         with cgutils.for_range(builder, arguments[6]) as loop:
             cell = builder.gep(base, [builder.load(builder.gep(which, [loop.index]))])

@@ -104,7 +104,7 @@ class PolicyRows(RowFunction):
         self._used: set[int] = set()
         self.sums: dict[str, int] = {}
         self.summed: dict[str, tuple[str, tuple[int, ...], tuple[int, ...], int]] = {}
-        super().__init__(function, inputs, rows, apart=True)
+        super().__init__(function, inputs, rows)
 
     # -- where tensors lie -----------------------------------------------------------------------------------------
 

@@ -109,9 +109,8 @@ class RowFunction:
 
     ``inputs`` are examples with ``rows`` rows each. ``needs`` are the names of those that are read, and ``outs`` of
     those that are filled: in this order, behind what is ``fixed``, ``call`` takes their addresses. ``shapes`` and
-    ``types`` are those of the outputs, without rows. ``constants`` are the outputs that depend on no input, without
-    rows, and ``same`` those that are another one, in a shape of their own; ``apart`` fills these, too. ``pitches`` are
-    distances from row to row of outputs that do not lie one behind another.
+    ``types`` are those of the outputs, without rows. ``pitches`` are distances from row to row of outputs that do not
+    lie one behind another.
 
     Raises:
         Untraceable: For an operation that is not known here, or mixes rows.
@@ -128,7 +127,7 @@ class RowFunction:
 
     def __init__(
         self, function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor], rows: int, *,
-        apart: bool = False, pitches: Mapping[str, int] | None = None,
+        pitches: Mapping[str, int] | None = None,
     ) -> None:  # fmt: skip
         self._rows, self._pitches = rows, pitches or {}
         self._places: dict[int, Place] = {}
@@ -158,10 +157,7 @@ class RowFunction:
         self._parts += [lines for where, lines in self._loads.items() if where in read]
         for call in calls:
             self._print(*call)
-        self.constants = {name: self._plain(x) for name, x in results.items() if not (apart or self._known(x))}
-        moving = {name: x for name, x in results.items() if name not in self.constants}
-        self.same = {} if apart else self._twice(moving)
-        moving = {name: x for name, x in moving.items() if name not in self.same and self._by_row(name, x)}
+        moving = {name: x for name, x in results.items() if self._by_row(name, x)}
         self.shapes = {name: tuple(x.shape[1:]) for name, x in moving.items()}
         kinds = {name: self._kind(x) for name, x in moving.items()}
         real = np.dtype(np.float32 if self._floats == torch.float32 else np.float64)
@@ -241,17 +237,6 @@ class RowFunction:
     def _more(self) -> list[str]:
         """Return the names of arrays that are filled beside the outputs."""
         return []
-
-    def _twice(self, outputs: Mapping[str, Tensor]) -> dict[str, tuple[str, tuple[int, ...]]]:
-        """Return outputs that are the numbers of another one, with its name and their own shape without rows."""
-        first: dict[Any, str] = {}
-        twice = {}
-        for name, x in outputs.items():
-            strides = tuple(s for s, n in zip(x.stride()[1:], x.shape[1:], strict=True) if n > 1)
-            other = first.setdefault((self._place(x)[:3], strides, x.numel()), name)
-            if other != name:
-                twice[name] = (other, tuple(x.shape[1:]))
-        return twice
 
     # -- where tensors lie -----------------------------------------------------------------------------------------
 

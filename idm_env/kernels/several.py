@@ -122,8 +122,7 @@ def rollout(
             wishes = decision(simulator, Form.of(state._replace(lanes=None), inputs))
         alike = len(phase) == 1
         if own_turn.all() and alike:
-            after = _decided(traffic, wishes, state, _cut(inputs, done, None), params, int(phase[0]))
-            if after is None:
+            if (after := _decided(traffic, wishes, state, _cut(inputs, done, None), params, int(phase[0]))) is None:
                 return None
             state = after
         until = min(int(((stage - phase - 1) % every + 1).min()) for stage in stages) if stops else steps - done
@@ -161,11 +160,8 @@ def rollout(
 def _decided(traffic: Traffic, wishes: Any, state: State, inputs: Inputs, params: Params, stage: int) -> State | None:
     """Return the state after all rows have decided, ``stage`` steps into a period; None where links are no order."""
     simulator = traffic.simulator
-    if stage == 0:
-        state = traffic.begin(state, params)
-    if not simulator.lane_change_models:
-        return state
-    return traffic.decide(wishes, state, inputs, params, stage)
+    state = traffic.begin(state, params) if stage == 0 else state
+    return traffic.decide(wishes, state, inputs, params, stage) if simulator.lane_change_models else state
 
 
 def _some_decided(
@@ -229,16 +225,14 @@ def _placed(tree: Tree, places: Places, state: State, leading: int = 0) -> Tree:
 
 def _moved(memory: Mapping[str, Tensor], index: Tensor, n: int) -> dict[str, Tensor]:
     """Return memories in another order; the past has vehicles before its slots and signals."""
-    moved = {}
-    for name, x in memory.items():
+
+    def moved(name: str, x: Tensor) -> Tensor:
         if name == PAST:
             full = x.expand(*index.shape[:-1], *x.shape[-3:])
-            moved[name] = full.gather(-3, index[..., None, None].expand(*index.shape, *x.shape[-2:]))
-        elif x.dim() and x.shape[-1] == n and n > 1:
-            moved[name] = x.expand(*index.shape[:-1], n).gather(-1, index)
-        else:
-            moved[name] = x
-    return moved
+            return full.gather(-3, index[..., None, None].expand(*index.shape, *x.shape[-2:]))
+        return x.expand(*index.shape[:-1], n).gather(-1, index) if x.dim() and x.shape[-1] == n and n > 1 else x
+
+    return {name: moved(name, x) for name, x in memory.items()}
 
 
 def _row(state: State, places: Places) -> State:

@@ -44,7 +44,8 @@ class Recurrent(nn.Module):
 
 CASES = [
     ("ring", {"warmup": 20, "max_episode_steps": 12, "failsafe": 3.0}, "all", "float32"),
-    ("ring", {"warmup": 5, "effects": ["delay", "memory"], "max_episode_steps": 30}, "tanh", "float64"),
+    ("ring", {"warmup": 5, "effects": ["delay", "memory"], "hold": 0.2, "max_episode_steps": 30}, "tanh", "float64"),
+    ("merge", {"vehicles": 24, "controlled": 1, "hold": 0.3, "max_episode_steps": 9}, "tanh", "float64"),
     ("follow", {"max_episode_steps": 25}, "tanh", "float64"),
 ]
 REMEMBERING = [

@@ -43,7 +43,7 @@ def test_rows_of_any_length_and_their_adjoint_are_torchs(size):
         return {"to_x": back(**leaves)["x"]}
 
     for function, inputs in ((around, {"x": x}), (pulled, {"x": x, **seeds})):
-        out = called(RowFunction(function, inputs, MANY, apart=True), {n: v.numpy() for n, v in inputs.items()}, MANY)
+        out = called(RowFunction(function, inputs, MANY), {n: v.numpy() for n, v in inputs.items()}, MANY)
         for name, expected in function(**inputs).items():
             np.testing.assert_allclose(out[name], expected.numpy(), rtol=1e-14)
 
@@ -88,7 +88,7 @@ def test_a_whole_step_on_several_lanes_is_one_function_of_rows():
         after = EnvState(simulator.step(world_of(leaves, world).state, {}, params), {})
         return {f"then_{n}": x for n, x in named(after).items()}
 
-    loops = RowFunction(step, examples_of(world, MANY), MANY, apart=True)
+    loops = RowFunction(step, examples_of(world, MANY), MANY)
     leaves = {n: x.contiguous() for n, x in named(world).items()}
     for _ in range(40):
         out, after = called(loops, {n: x.numpy() for n, x in leaves.items()}), step(**leaves)
