@@ -40,6 +40,11 @@ class Law(NamedTuple):
         return self.model.catalogue.personal
 
     @property
+    def parameters(self) -> int:
+        """Number of parameters that every driver has of his own."""
+        return len(self.model.catalogue.own)
+
+    @property
     def title(self) -> str:
         """Plain name."""
         title = self.law.title or self.law.kind
@@ -128,8 +133,8 @@ def rows(laws: Iterable[Law]) -> list[LawErrors]:
     """Return the rows of a report's table of laws."""
     return [
         LawErrors(
-            each.law.kind, each.title, each.law.equation, list(each.own), each.at_best, **each.errors.summary(),
-            against=against_rows(each.against, not each.at_best),
+            each.law.kind, each.title, each.law.equation, list(each.own), each.parameters, each.at_best,
+            **each.errors.summary(), against=against_rows(each.against, not each.at_best),
         )
         for each in laws
     ]  # fmt: skip

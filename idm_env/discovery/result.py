@@ -235,12 +235,16 @@ class Against:
 
 @dataclass(frozen=True)
 class LawErrors:
-    """A law alone: its errors, and how they compare with the null's; ``own`` are effects of each driver's strength."""
+    """A law alone: its errors, and how they compare with the null's; ``own`` are effects of each driver's strength.
+
+    ``parameters`` is how many each driver has of his own.
+    """
 
     base: str
     title: str
     equation: str
     own: list[str]
+    parameters: int
     fitted_to_what_is_judged: bool
     gap_rmse_m: float
     horizon_rmse_m: float

@@ -370,7 +370,8 @@ def law_first(law: Law, null: str, drivers: Solution | None = None, note: str = 
         note = f"median driver and 10 to 90 %: {', '.join(_of_drivers(drivers))}{f'; {note}' if note else ''}"
     note = note or f"what it lacks: explain --base {law.law.kind}"
     title = f"{law.title[:1].upper()}{law.title[1:]}"
-    return f"{title} predicts better than {null} calibrated alike: {_changes(law.against)} ({note})."
+    alike = f"calibrated alike, with {law.parameters} parameters a driver"
+    return f"{title} predicts better than {null} {alike}: {_changes(law.against)} ({note})."
 
 
 def none_holds(refusal: Refusal | None, tried: str) -> str:
