@@ -143,7 +143,7 @@ def features(d: Discovery) -> Figure:
             axis.errorbar(centre, mean, error, color=colour, lw=1.1, marker=".", ms=4, label=label, capsize=0)
             axis.axhline(0, color=TRUTH, lw=0.5)
             unit = FEATURES[name]
-            axis.set_xlabel(words.ALONG[name] + ("" if unit == "1" else f" ({unit})"))
+            axis.set_xlabel(words.ALONG[name] + ("" if unit == "1" else f"\n({unit})"))
     figure.legend(handles=axes[0, 0].get_legend_handles_labels()[0], loc="outside upper left", ncols=2)
     figure.supylabel("residual (m/s²)", fontsize=9)
     return figure

@@ -12,18 +12,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from idm_env.effects import DriverCurve
 from idm_env.effects.base import Effect, P
-from idm_env.effects.free import (
-    FEATURES,
-    HISTORY,
-    PER,
-    DriverCurve,
-    OverFeature,
-    feature_of,
-    first_history,
-    next_history,
-    share_of,
-)
+from idm_env.effects.free import FEATURES, HISTORY, PER, OverFeature, feature_of, first_history, next_history, share_of
 from idm_env.effects.places import curve
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene

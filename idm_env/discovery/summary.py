@@ -113,7 +113,8 @@ def summarise(
         ),
         ceilings=ceilings,
         bases=bases.rows(laws),
-        completed=_completed(judged, beyond),
+        completed=None if (on := judged.on) is None
+        else result.Completed(on.law.kind, on.title, list(on.own), bases.against_rows(beyond)),
         fleet=None if judged.fleet is None else fleet.told(judged.fleet),
     )  # fmt: skip
 
@@ -123,12 +124,6 @@ def _against_first(judged: Judgement) -> dict[str, Comparison]:
     if judged.beneath is None or judged.beneath.before is None or judged.after is None:
         return {}
     return compare(judged.beneath.before, judged.after, judged.seed)
-
-
-def _completed(judged: Judgement, against: dict[str, Comparison]) -> result.Completed | None:
-    if judged.on is None:
-        return None
-    return result.Completed(judged.on.law.kind, judged.on.title, list(judged.on.own), bases.against_rows(against))
 
 
 def _of_laws(judged: Judgement, drivers: Solution | None) -> list[str]:

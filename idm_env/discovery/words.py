@@ -45,8 +45,8 @@ ALONG = {
     "position": "place", "time": "time", "speed": "speed", "gap": "gap", "closing_speed": "closing speed",
     "lead_accel": "leader's acceleration", "relative_gap": "gap relative to the desired one",
     "time_since_stop": "time since the last stop", "mean_speed_20s": "mean speed of the last 20 s",
-    "mean_speed_90s": "mean speed of the last 90 s", "braking_15s": "hardest braking of the last 15 s",
-    "lead_braking_15s": "leader's hardest braking of the last 15 s",
+    "mean_speed_90s": "mean speed of the last 90 s", "braking_15s": "hardest recent braking",
+    "lead_braking_15s": "leader's hardest recent braking",
 }  # fmt: skip
 MANY = 4
 """A term with more parameters than this is a curve: its range is told instead."""
