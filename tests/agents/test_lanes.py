@@ -30,6 +30,7 @@ def test_in_free_traffic_what_comes_goes(short):
     assert found["outflow"] == pytest.approx(sum(found["outflows"]) / 2)
 
 
+@pytest.mark.usefixtures("torch_path")
 @pytest.mark.parametrize("more", [{}, {"noise": 0.2}, {"failsafe": 3.0, "lane_commands": True}], ids=str)
 def test_the_return_that_is_judged_is_the_environments(monkeypatch, more):
     """A rollout between two decisions pays what the steps of an environment pay, human drivers or agents."""
