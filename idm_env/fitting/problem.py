@@ -287,8 +287,9 @@ class Problem:
             return samples, tangents
 
         directions = one.expand(-1, *point.shape)
-        samples, (gap_by, speed_by) = torch.func.vmap(along, out_dims=(None, 1))(directions)  # type: ignore[arg-type]
-        return self.residual(samples), self._weigh(gap_by, speed_by)
+        # A tangent that is the same in all directions is put before its dimensions only: vmap fails at another place.
+        samples, tangents = torch.func.vmap(along, out_dims=(None, 0))(directions)  # type: ignore[arg-type]
+        return self.residual(samples), self._weigh(*(x.movedim(0, 1) for x in tangents))
 
 
 def group_of(episodes: Sequence[Episode], by: str) -> tuple[Tensor, tuple[str, ...]]:
