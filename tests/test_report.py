@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from idm_env.data import Repair
 from idm_env.reports import page
 
 ROWS = [
@@ -64,7 +65,8 @@ def test_a_click_sorts_and_no_page_scrolls_sideways(tmp_path: Path) -> None:
 
 def test_one_line_says_what_was_repaired_left_out_and_unreadable() -> None:
     assert page.account() == "Data: nothing was repaired or left out."
-    words = page.account([("missing row", 2), ("repeated", 1), ("missing row", 3)], [("too short", 4)], ["a.json", "b"])
+    repairs = [Repair("missing row", 2, ""), Repair("repeated", 1, ""), Repair("missing row", 3, "")]
+    words = page.account(repairs, [Repair("too short", 4, "")], ["a.json", "b"])
     assert words == "Data: repaired: missing row 5, repeated 1; left out: too short 4; 2 bad files: a.json, b."
     assert page.account(bad_files=[f"{i}.json" for i in range(7)]).endswith("4.json and 2 more.")
     assert "\n" not in words

@@ -197,7 +197,7 @@ def plot(
     if more:
         console.print(f"Drawn: {more[2:]}; more with --panels.", highlight=False)
     if source.suffix not in (".yaml", ".yml"):
-        console.print(account((r.kind, r.count) for r in repairs), soft_wrap=True, highlight=False)
+        console.print(account(repairs), soft_wrap=True, highlight=False)
     for path in written:
         answers.written("Picture", path)
 

@@ -37,11 +37,6 @@ def repaired(kind: str, count: int, words: str) -> list[Repair]:
     return [Repair(kind, count, f"{count} {words}")] if count else []
 
 
-def by_kind(repairs: Iterable[Repair]) -> list[tuple[str, int]]:
-    """Return the kind and the number of each, as ``reports.page.account`` takes them."""
-    return [(repair.kind, repair.count) for repair in repairs]
-
-
 @dataclass
 class Counted:
     """Repairs by kind and wording, added up over the pieces of a file."""

@@ -7,12 +7,21 @@ import math
 import polars as pl
 
 from idm_env.data.errors import DataError, Repair
-from idm_env.data.schema import HIGHEST_SPEED_MPS, LONGEST_LENGTH_M, LOWEST_SPEED_MPS, TRACK, taken_as_missing
+from idm_env.data.schema import (
+    DEFAULT_LENGTH_M,
+    HIGHEST_SPEED_MPS,
+    LONGEST_LENGTH_M,
+    LOWEST_SPEED_MPS,
+    TRACK,
+    taken_as_missing,
+)
 
 LONGEST_MEDIAN_LENGTH_M = 12.0
 LONGEST_STEP_S = 2.0
 MOVED_M, MOVED_S = 0.5, 1.0
 """A vehicle moves whose positions differ by more (m) over about so long (s): the noise of standing ones is less."""
+SAME_M = 0.01
+"""Gaps that differ by less from the distance of two fronts were taken from it (m)."""
 FOOT = 3.281
 # speed_mps divided by the change of position_m over the change of time_s, if one of the three is in another unit
 _MISTAKES = (
@@ -93,17 +102,26 @@ def _check_ratio(frame: pl.DataFrame, source: str, step: float | None) -> None:
 
 
 def check_gaps(joined: pl.DataFrame, source: str) -> None:
-    """Raise DataError if measured gaps are in feet and positions in metres, or the other way round.
+    """Raise DataError if measured gaps are in feet and positions in metres or the other way round, or hold a length.
 
     ``joined`` has gap_m, gap_measured, headway (front bumper to front bumper, from positions) and lead_length. Gaps of
     other origin than positions (radar, antennas) may differ from theirs by metres, but not by one factor.
     """
     pairs = joined.filter(pl.col("gap_measured")).select(
-        pl.col("gap_m").alias("given"), (pl.col("headway") - pl.col("lead_length")).alias("derived")
+        "headway",
+        "lead_length",
+        pl.col("gap_m").alias("given"),
+        (pl.col("headway") - pl.col("lead_length")).alias("derived"),
     )
     pairs = pairs.filter((pl.col("given") > 2.0) & (pl.col("derived") > 2.0))
     if pairs.height < 20:
         return
+    fronts = pairs.filter(pl.col("lead_length") != DEFAULT_LENGTH_M)  # else leaders may stand for their rear bumpers
+    if fronts.height >= 20 and fronts.select((pl.col("given") - pl.col("headway")).abs().quantile(0.9)).item() < SAME_M:
+        raise DataError(
+            f"{source}: gap_m is the distance from front to front, with the leader's length in it; subtract that, or "
+            "leave the column out."
+        )
     low, ratio, high = (pairs.select((pl.col("given") / pl.col("derived")).quantile(q)).item() for q in (0.2, 0.5, 0.8))
     for factor, wrong in ((FOOT, "gap_m looks like feet"), (1.0 / FOOT, "position_m looks like feet")):
         if 0.9 * factor < low <= high < 1.1 * factor:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from idm_env.data import Trajectories
-from idm_env.data.errors import by_kind
 from idm_env.data.fingerprint import fitted_on
 from idm_env.drift import held_out
 from idm_env.drift.estimate import Estimate
@@ -87,7 +86,7 @@ def drift_file(
             },
             "data": {
                 **trajectories.summary(), "episodes": len(both[0]), "taken": len(taken), "dt": best.drivers.batch.dt,
-                "account": page.account(by_kind(trajectories.repairs), by_kind(both[0].left_out)),
+                "account": page.account(trajectories.repairs, both[0].left_out),
             },
             "versions": page.versions(),
         }  # fmt: skip

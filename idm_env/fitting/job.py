@@ -12,7 +12,6 @@ import polars as pl
 import torch
 
 from idm_env.data import DataError, Episode, Episodes, Repair, Trajectories, noise_sigma
-from idm_env.data.errors import by_kind
 from idm_env.data.fingerprint import Track, marks, seen
 from idm_env.data.folder import FolderSlice, shares, stamp
 from idm_env.data.schema import TRACK
@@ -123,12 +122,17 @@ def _fit_file(work: _Work) -> dict[str, Any]:
             pooled = work.fit([chosen], "all", "pooled", "held out: ")
         held_out, lost = _held_out(source, options, held, joined.estimates, pooled.estimates)
         left_out += lost
-    data = {**trajectories.summary(), "left_out": [str(r) for r in chosen.left_out], "episodes": len(chosen)}
-    data["account"] = page.account(by_kind(trajectories.repairs), by_kind(left_out))
-    data["noise"] = _noise(trajectories, source.path)
+    account = page.account(trajectories.repairs, left_out)
+    data = {**_data(trajectories, chosen), "account": account, "noise": _noise(trajectories, source.path)}
     result = _write(work, joined, held_out, data, marks(trajectories, _drivers(chosen)))
     pooled.parts.remove()
     return result
+
+
+def _data(trajectories: Trajectories, items: Episodes) -> dict[str, Any]:
+    """Return the counts of a file, its repairs and the rows left out."""
+    left_out, account = [str(r) for r in items.left_out], page.account(trajectories.repairs, items.left_out)
+    return {**trajectories.summary(), "left_out": left_out, "episodes": len(items), "account": account}
 
 
 def _noise(trajectories: Trajectories, path: Path) -> str:
@@ -159,7 +163,7 @@ def _write(
     out, options, estimates = work.out, work.options, joined.estimates
     error = joined.errors.summary()
     bounds, many = drivers.bounds(estimates), len(estimates.groups) > drivers.MOST_ROWS
-    failed = drivers.failure(bounds, joined.errors)
+    failed, rest = drivers.failure(bounds, joined.errors), held_out or {}
     result: dict[str, Any] = {
         "schema": 1,
         "command": page.command_line(),
@@ -175,11 +179,7 @@ def _write(
         "failed": failed,
         "at_bounds": drivers.sentence(bounds),
         "over_fitting": drivers.over_fitting(
-            bounds,
-            error["gap_rmse_m"],
-            None if held_out is None else held_out["gap_rmse_m"],
-            options.by,
-            "runs" if held_out is None else held_out["parts"],
+            bounds, error["gap_rmse_m"], rest.get("gap_rmse_m"), options.by, rest.get("parts", "runs")
         ),
         "bounds": bounds,
         "parameters": [],
@@ -264,14 +264,10 @@ def _fit_page(result: dict[str, Any], joined: JoinedFit, table: list[dict[str, A
         lead += f" On {held['episodes']} episodes of held-out {held['parts']}: {held['gap_rmse_m']:.2f} m."
     rows = [{"": "fitted", **result["fit"]}] + ([] if held is None else [{"": f"held-out {held['parts']}", **held}])
     figures = joined.pictures
-    parts = len(joined.summaries)
-    several = [page.note(f"Pictures are of the first of {parts} parts.")] if parts > 1 else []
+    several = [page.note(f"Pictures: the first of {len(joined.summaries)} parts.")] if joined.summaries[1:] else []
     titles = ("Measured and simulated", "Residuals", "In space and time")
     return [
-        *([page.lead(result["failed"])] if result["failed"] else []),
-        page.lead(lead),
-        *([page.lead(result["data"]["noise"])] if result["data"].get("noise") else []),
-        *([page.lead(result["over_fitting"])] if result["over_fitting"] else []),
+        *map(page.lead, filter(None, (result["failed"], lead, result["data"].get("noise"), result["over_fitting"]))),
         page.text(result["at_bounds"]),
         page.table(in_words(rows)),
         page.note(
@@ -372,12 +368,7 @@ def _simulate_file(
         "schema": 1,
         "command": page.command_line(),
         "model": name,
-        "data": {
-            **trajectories.summary(),
-            "left_out": [str(r) for r in items.left_out],
-            "episodes": len(items),
-            "account": page.account(by_kind(trajectories.repairs), by_kind(items.left_out)),
-        },
+        "data": _data(trajectories, items),
         "drivers_with_own_parameters": matched,
         "drivers": drivers_in_words(model, matched, len(items)),
         "error": error.summary(),

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from idm_env.data import DataError, Trajectories
-from idm_env.data.errors import by_kind
 from idm_env.effects import IDM, Brakes, Mobil, base_named
 from idm_env.fitting import discrete_choice
 from idm_env.fitting.lane_decisions import Decisions, recorded_decisions
@@ -168,7 +167,7 @@ def fit_lane_changes(
 
 def _result(fit: LaneChanges, trajectories: Trajectories, options: ChangeOptions) -> dict[str, Any]:
     decisions, compared = fit.decisions, fit.compared()
-    account = page.account(by_kind(trajectories.repairs), by_kind(decisions.left_out))
+    account = page.account(trajectories.repairs, decisions.left_out)
     left = int((decisions.chosen == 1).sum())
     return {
         "schema": 1,

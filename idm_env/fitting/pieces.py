@@ -15,7 +15,7 @@ import polars as pl
 import torch
 
 from idm_env.data import DataError, Episode, Repair, Trajectories
-from idm_env.data.errors import Counted, by_kind
+from idm_env.data.errors import Counted
 from idm_env.data.fingerprint import marks
 from idm_env.data.folder import FolderSlice
 from idm_env.fitting import drivers, pictures
@@ -180,5 +180,5 @@ def account_of(joined: JoinedFit, source: str) -> dict[str, Any]:
         "repairs": [{"kind": r.kind, "count": r.count, "text": r.text} for r in repairs.repairs()],
         "left_out": [r.text for r in left_out.repairs()],
         "episodes": len(joined.errors.gap_rmse),
-        "account": page.account(by_kind(repairs.repairs()), by_kind(left_out.repairs())),
+        "account": page.account(repairs.repairs(), left_out.repairs()),
     }

@@ -11,6 +11,7 @@ import numpy as np
 import polars as pl
 
 from idm_env.data import DataError
+from idm_env.data.errors import repaired
 from idm_env.data.scenario import Scenario
 from idm_env.data.womd import count, scenarios
 from idm_env.jobs import storage
@@ -151,13 +152,8 @@ def _predict_file(job: _Job, progress: OnProgress) -> None:
                 pictures.append({"text": block.text, "image": block.image})
     job.parts.write(job.number, "predictions", pl.concat(tables or [pl.DataFrame(schema=SCHEMA)]))
     job.parts.write(job.number, "parameters", pl.DataFrame(rows, schema=PARAMETERS))
-    job.parts.finish(
-        job.number,
-        {
-            "scenarios": scenario_count, "agents": len(tables), "scores": scores, "left_out": left_out, "notes": notes,
-            "pictures": pictures,
-        },
-    )  # fmt: skip
+    counts = {"scenarios": scenario_count, "agents": len(tables), "scores": scores, "left_out": left_out}
+    job.parts.finish(job.number, {**counts, "notes": notes, "pictures": pictures})
 
 
 def _readable(path: str | Path, left_out: list[dict[str, str]]) -> Iterator[Scenario]:
@@ -239,6 +235,7 @@ def _report(parts: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], list[page.
         return [{**row, "intervals": between[row["method"]]} for row in rows()]
 
     left_out = [item for part in parts for item in part["left_out"]]
+    bad = [item["file"] for item in left_out if "file" in item]
     pictures = [page.Block("figure", **item) for part in parts for item in part["pictures"]]
     return {
         "scenarios": sum(part["scenarios"] for part in parts),
@@ -248,11 +245,7 @@ def _report(parts: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], list[page.
         "scenes": {name: rows(scene=name) for name in sorted({where for where, _ in scores})},
         "kinds": {kind: rows(kind=kind) for kind in sorted({item[OURS].kind for _, item in scores})},
         "left_out": left_out,
-        "account": page.account(
-            (),
-            [("agents", 1) for item in left_out if "file" not in item],
-            [item["file"] for item in left_out if "file" in item],
-        ),
+        "account": page.account((), repaired("agents", len(left_out) - len(bad), ""), bad),
         "notes": [item for part in parts for item in part["notes"]],
         "versions": page.versions(),
     }, pictures[:MOST_PICTURES]

@@ -6,6 +6,7 @@ import base64
 import io
 import platform
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -183,16 +184,17 @@ def write_page(
     write_text(path, page)
 
 
-def account(
-    repairs: Iterable[tuple[str, int]] = (), left_out: Iterable[tuple[str, int]] = (), bad_files: Iterable[str] = ()
-) -> str:
-    """Return one line on the data: what was repaired and left out, by kind and number, and bad files by name."""
+def account(repairs: Iterable[Any] = (), left_out: Iterable[Any] = (), bad_files: Iterable[str] = ()) -> str:
+    """Return one line on the data: what was repaired and left out, by kind and number, and bad files by name.
 
-    def count_kinds(items: Iterable[tuple[str, int]]) -> str:
-        sums: dict[str, int] = {}
-        for kind, count in items:
-            sums[kind] = sums.get(kind, 0) + count
-        return ", ".join(f"{kind} {count}" for kind, count in sorted(sums.items(), key=lambda item: -item[1]))
+    ``repairs`` and ``left_out`` are ``data.Repair``: what has a ``kind`` and a ``count``.
+    """
+
+    def count_kinds(items: Iterable[Any]) -> str:
+        sums: Counter[str] = Counter()
+        for item in items:
+            sums[item.kind] += item.count
+        return ", ".join(f"{kind} {count}" for kind, count in sums.most_common())
 
     names = list(bad_files)
     shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

@@ -18,6 +18,7 @@ import numpy as np
 import polars as pl
 
 from idm_env.data import DataError
+from idm_env.data.errors import repaired
 from idm_env.data.folder import stamp
 from idm_env.data.names import Columns
 from idm_env.jobs import storage
@@ -270,7 +271,7 @@ def _report(spool: Spool, parts: Sequence[dict[str, Any]], settings: FilterSetti
         "methods": [{"method": name, **tally.row()} for name, tally in tallies.items()],
         "overlapping_rows": totals["overlaps"],
         "overlapping_rows_that_did_not_overlap_before": totals["new_overlaps"],
-        "account": account(((r.kind, r.count) for r in spool.repairs), [("tracks", len(lost))] if lost else []),
+        "account": account(spool.repairs, repaired("tracks", len(lost), "")),
         "versions": versions(),
     }
 

@@ -274,6 +274,16 @@ def with_gaps(factor: float) -> pl.DataFrame:
     return table.with_columns(gap.alias("gap_m"))
 
 
+def test_gaps_with_a_length_in_them_are_refused_where_lengths_are_given() -> None:
+    """Positions of some files are those of the leader's rear bumper: their vehicles have no length."""
+    table = platoon()
+    lead = table.select("run_id", "time_s", leader_id="vehicle_id", lead="position_m")
+    table = table.join(lead, on=["run_id", "time_s", "leader_id"], how="left")
+    table = table.with_columns(gap_m=pl.col("lead") - pl.col("position_m")).drop("lead")
+    fails(table.with_columns(length_m=pl.lit(4.2)), "from front to front", "subtract that")
+    assert make(table.with_columns(length_m=pl.lit(0.0))).table["gap_measured"].any()
+
+
 def test_gaps_in_feet_beside_positions_in_metres_are_refused() -> None:
     fails(with_gaps(3.281), "gap_m looks like feet", "0.3048")
     make(with_gaps(1.0))
