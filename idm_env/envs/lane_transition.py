@@ -130,6 +130,8 @@ class Commands:
 
         examples = {n: x for n, x in step.inputs.items() if n in step.sample or n in ("action", "live")}
         self.loops = RowFunction(inputs_of, examples, step.many)
+        rows = len(world.state.speed)
+        self.arrays = Room({n: (rows, *shape) for n, shape in self.loops.shapes.items()}, self.loops.types).arrays
 
 
 class LaneTables(Tables):
@@ -143,8 +145,8 @@ class LaneTables(Tables):
         self.by_record = any(n.startswith("then_links") for n in self.recorded.forward.outs)
         """Whether a step itself writes who leads whom."""
         self.clock = np.empty(plan.rows, plan.real)
-        self.ask = RowTable(plan.commands.loops, layout.still | plan.room.arrays, plan.groups(""))
-        self.decides: Any = None if plan.found is None else self._decision(plan.found)
+        self.ask = RowTable(plan.commands.loops, layout.still | plan.commands.arrays, plan.groups(""))
+        self.decides: Any = None if plan.wishes is None else self._decision(plan.wishes)
 
     def _decision(self, wishes: Any) -> Any:
         """Return the plan of what drivers wish, and what in it moves: blocks, what is given, and who is led.
@@ -231,27 +233,32 @@ class LaneTransition(CompiledTransition):
     def _tables(self, layout: Layout, params: Params) -> Tables:
         """Lay out what parameters give."""
         step = self.recorded(params)
-        if not hasattr(self, "commands"):
-            self._record(step)
         if self.world.state.present is not None and step not in self._turns:
             self._turns[step] = Stage(self, self._turned(step), step.sample, step.many, step.wanted)
         return LaneTables(self, layout, params)
 
-    def _record(self, step: WholeStep) -> None:
-        """Record commands, and what decisions do."""
-        simulator, self.many = self.task.simulator, step.many
-        commands = Commands(step, self.moves, self.world)
-        self.found: Any = None
-        self.room = Room({n: (self.rows, *s) for n, s in commands.loops.shapes.items()}, commands.loops.types)
-        if simulator.lane_change_models:
-            self.found = decision(simulator, Form.of(self.world.state._replace(lanes=None), commands.inputs))
-            if isinstance(self.found, str):
-                raise Untraceable(self.found)
-            examples = {n: x for n, x in step.sample.items() if n not in step.parameters}
-            like = torch.zeros(step.many, self.size, dtype=torch.int64)
-            sees = {"merger": like} if simulator.sees_mergers else {}
-            self.settle = Stage(self, self._settled, {**examples, "fresh": like == 0, **sees}, step.many)
-        self.commands = commands
+    @cached_property
+    def commands(self) -> Commands:
+        """The inputs of a step as drivers see them who think of changing lanes."""
+        return Commands(next(iter(self._recorded.values())), self.moves, self.world)
+
+    @cached_property
+    def wishes(self) -> Any:
+        """The compiled decision, None where nobody changes lanes. Untraceable where it cannot be recorded."""
+        form = Form.of(self.world.state._replace(lanes=None), self.commands.inputs)
+        wishes = decision(self.task.simulator, form) if self.task.simulator.lane_change_models else None
+        if isinstance(wishes, str):
+            raise Untraceable(wishes)
+        return wishes
+
+    @cached_property
+    def settle(self) -> Stage:
+        """The stage of gaps to new leaders, and of who signals, after a decision."""
+        step = next(iter(self._recorded.values()))
+        examples = {n: x for n, x in step.sample.items() if n not in step.parameters}
+        like = torch.zeros(step.many, self.size, dtype=torch.int64)
+        sees = {"merger": like} if self.task.simulator.sees_mergers else {}
+        return Stage(self, self._settled, {**examples, "fresh": like == 0, **sees}, step.many)
 
     def _turned(self, step: WholeStep) -> Callable[..., dict[str, Tensor]]:
         """Return the function of what changes where vehicles come and go."""
@@ -308,7 +315,7 @@ class LaneTransition(CompiledTransition):
         phase = moment.clock % self.task.simulator.decides_after
         if bound.recorded in self._turns:
             lanes.turned = np.flatnonzero(phase == 0)
-        if self.found is not None:
+        if self.wishes is not None:
             lanes.decided = np.flatnonzero(np.isin(phase, self._stages) if len(self._stages) > 1 else phase == 0)
         begins = now.data_ptr(), address(whole)
         if len(lanes.turned) or len(lanes.decided):
@@ -338,7 +345,7 @@ class LaneTransition(CompiledTransition):
         if inputs:
             self.commands.loops.run(0, self.rows, bound.ask.pointer(moment.given, tuple(begins)))
             for i, name in inputs:
-                where = self.room.arrays.get(name)
+                where = self.commands.arrays.get(name)
                 plan[i, lane_change_loops.ADDRESS] = moment.given[name] if where is None else address(where)
         if not self.ring:
             lane_change_loops.mark_led(lanes.decided, self.size, *lanes.whole_mid[1:3], marks["led"], marks["leads"])
@@ -350,7 +357,7 @@ class LaneTransition(CompiledTransition):
         if not lane_change_loops.decide(
             lanes.whole_mid[: len(LINKS)], blocks["state_position"], blocks.get("state_present", self._absent), coming,
             lanes.decided, stages, self.size, self.road.count, self.ring, self.road.handed == "left", self.tables,
-            plan, places, phase_at, constants, len(self.found.slots), lanes.fresh, lanes.merger, self.turns, order,
+            plan, places, phase_at, constants, len(self.wishes.slots), lanes.fresh, lanes.merger, self.turns, order,
             begin,
         ):  # fmt: skip
             raise Unordered("links are not the order of positions")
