@@ -262,6 +262,7 @@ def test_the_first_pages_are_short() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 120 and len(text.split()) <= 800
     assert (ROOT / "docs" / "ring.gif").stat().st_size <= 800_000
+    assert all(path.stat().st_size <= 300_000 for path in (ROOT / "docs" / "tasks").iterdir())
     for name in ("README.md", "docs/index.md"):
         lengths = sorted((len(s.split()), s) for s in sentences(ROOT / name))
         assert lengths[len(lengths) // 2][0] <= 15 and lengths[-1][0] <= 35, f"{name}: {lengths[-1]}"

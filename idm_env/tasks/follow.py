@@ -80,7 +80,7 @@ class FollowTask(BehindHeadTask):
         one_of("fuel_model", self.fuel_model, metrics.FUELS)
         super().__post_init__()
         only_with(self, "source", ("fuel_weight", "lag_weight"))
-        longest = self._longest
+        longest = self._longest // self.held
         if (self.max_episode_steps or 0) > longest:
             raise ValueError(
                 f"max_episode_steps = {self.max_episode_steps} exceeds the {longest} steps of the longest record after "

@@ -82,6 +82,8 @@ def test_more_than_the_record_has_is_an_error(task, face):
     with pytest.raises(ValueError, match=r"max_episode_steps = 60000 exceeds the \d+ steps") as caught:
         face("DiffIDM-v0", task=task, max_episode_steps=60000)
     assert "\n" not in str(caught.value).split(" was raised")[0]
+    with pytest.raises(ValueError, match=r"exceeds the \d+ steps"):  # of a second each
+        face("DiffIDM-v0", task=task, max_episode_steps=5000, hold=1.0)
 
 
 def test_no_limit_is_no_limit():
