@@ -120,7 +120,7 @@ class OpenLanesTask(LanesTask):
     )  # fmt: skip
     own_parameters: ClassVar = {
         "idm": {"max_accel": 1.5, "comfort_decel": 2.0, "time_gap": 1.2, "min_gap": 2.0, "desired_speed": 30.0},
-        "mandatory_change": {"turns": 1.0},
+        "mandatory_change": {"reach": 400.0, "turns": 1.0},
         "courtesy": {"weight": 1.0, "zipper": 1.0},
     }
 
