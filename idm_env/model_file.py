@@ -204,7 +204,11 @@ def make_effects(descriptions: Iterable[str | Mapping[str, Any] | Effect]) -> tu
 
     ValueError for anything else.
     """
-    if isinstance(descriptions, (str, Mapping)) or not isinstance(descriptions, Iterable):
+    if (
+        isinstance(descriptions, (str, Mapping))
+        or not isinstance(descriptions, Iterable)
+        or hasattr(descriptions, "ndim")
+    ):
         raise ValueError(f"effects = {shown(descriptions)} must be a list, such as [idm, brakes].")
     effects = []
     for description in descriptions:

@@ -77,9 +77,7 @@ class CarFollowingStep:
             raise ValueError("who takes turns to decide does not see who signals: leave stagger or that effect out.")
         longest = next((p.high for p in self._following.parameters if p.name == "time_gap"), float("inf"))
         if not 0.0 < self.dt <= longest:
-            raise ValueError(
-                f"dt = {self.dt:g} s is outside (0, {longest:g}] s: no step may be longer than a driver's time gap."
-            )
+            raise ValueError(f"dt = {self.dt:g} s is outside (0, {longest:g}] s: no step is longer than a time gap.")
 
     # -- composition ---------------------------------------------------------------------------------------------
 

@@ -175,6 +175,21 @@ def test_a_bad_number_is_refused_by_the_name_of_its_flag(
     assert line.startswith(f"error: {flag} = ") and not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("value", ["nan", "1e400", "abc", "True", "1,2", "0x10", "[1]"])
+def test_what_is_no_number_is_one_line_with_its_flag_and_value(data: Path, value: str) -> None:
+    """As one word and as two; it was a usage line and three more, without the value."""
+    for words in ([f"--seed={value}"], ["--seed", value]):
+        done = typed("fit", data, *words)
+        assert done.returncode == 2 and done.stderr.startswith(f"error: --seed = '{value}': ")
+        assert done.stderr.count("\n") == 1, done.stderr
+
+
+@pytest.mark.parametrize("words", [["--out="], ["--out", ""], ["--model", "  "], ["--base="], [""]])
+def test_an_empty_value_is_refused(data: Path, words: list[str]) -> None:
+    """As an unset variable of a shell leaves it; results went to the folder in which one stood."""
+    assert "= '' is empty, as an unset variable is" in refused("fit", data, *words)
+
+
 def test_every_number_of_the_command_line_is_checked_in_the_one_place() -> None:
     found = 0
     for command in cli.app.registered_commands:

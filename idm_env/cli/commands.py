@@ -647,6 +647,9 @@ for _command in app.registered_commands:
 def run() -> None:
     """Run the command line: bad input ends with one line and exit code 1, Ctrl-C with 130."""
     try:
+        for option, mark, value in (word.partition("=") for word in sys.argv[1:]):
+            if not (value if mark and option.startswith("--") else option + mark + value).strip():
+                raise ValueError(f"{option if mark else 'a value'} = '' is empty, as an unset variable is. Give one.")
         code = app(standalone_mode=False)  # an exit code where typer has dealt with the end itself
     except Exception as error:
         # A library may turn an interruption into an error of another kind; typer makes EOFError an Abort.
@@ -658,7 +661,11 @@ def run() -> None:
             _failed(cause)
         if not hasattr(error, "show"):
             raise
-        error.show()  # a usage error: typer's own message, with the usage line
+        names = getattr(getattr(error, "param", None), "opts", [])
+        pairs = (word.partition("=") for word in [*sys.argv, ""])
+        for value in (value if mark else next(pairs)[0] for name, mark, value in pairs if name in names):
+            _failed(ValueError(f"{names[0]} = {validation.shown(value)}: {error.message}"), 2)  # type: ignore[attr-defined]
+        error.show()  # another usage error: typer's own message, with the usage line
         sys.exit(getattr(error, "exit_code", 2))
     except KeyboardInterrupt:
         _interrupted()
@@ -674,14 +681,14 @@ def run() -> None:
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _failed(error: Exception) -> NoReturn:
+def _failed(error: Exception, code: int = 1) -> NoReturn:
     """End with one line that says what is wrong, never longer than a terminal can take."""
     reason = storage.full(error) or str(error) or type(error).__name__
     if storage.lacks_memory(error):
         reason = "this needs more memory than there is. Take fewer vehicles, runs or draws at a time, or free memory."
     text = " ".join(" ".join([reason, *getattr(error, "__notes__", ())]).split())
     print(f"error: {text if len(text) <= 1000 else text[:1000] + ' …'}", file=sys.stderr)
-    sys.exit(1)
+    sys.exit(code)
 
 
 def _interrupted() -> NoReturn:

@@ -234,9 +234,7 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
     read_tables = {node.label for node in graph.serial if node.op == "table"}
     for name, number in catalogue.tables.items():
         if number not in read_tables:
-            raise ValueError(
-                f"effect '{name}' is sought or given as a profile and does not read it by effects.places.curve."
-            )
+            raise ValueError(f"effect '{name}' is a profile and does not read it by effects.places.curve.")
     memories = list(recorded.begin)
     driver = {f"{name}.{p.name}": f"th[{i}]" for i, (name, p) in enumerate(catalogue.of_driver)}
     inputs = {slot_name(e.name, ""): "pulse_now" for e in _slots(PULSE)}

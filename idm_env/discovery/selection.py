@@ -172,9 +172,7 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
         if not scored and rounds:
             break
         if not scored:
-            raise ValueError(
-                f"{', '.join(searching.names)}: no place or time in these data is long enough to be tried."
-            )
+            raise ValueError(f"{', '.join(searching.names)}: no place or time in these data is long enough to try.")
         tested = _tested(searching, scored, seed)
         order = np.argsort(-tested.gain)
         fitted = [i for i in order if scored[i].solution is not None and tested.p_value[i] < 2 * ALPHA]

@@ -96,9 +96,7 @@ class SB3VecEnv(VecEnv):
 
     def _all(self, indices: Any, what: str) -> None:
         if indices is not None and len(set(self._get_indices(indices))) != self.num_envs:
-            raise ValueError(
-                f"{what} belongs to the whole batch, and indices = {shown(indices)} names a part. Leave indices out."
-            )
+            raise ValueError(f"{what} is the whole batch's, and indices = {shown(indices)} names a part. Leave it out.")
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None) -> list[bool]:
         """Return False for every environment: a native batch has no wrapped environments in it."""

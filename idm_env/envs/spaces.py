@@ -43,9 +43,7 @@ def continuous(action: Any, levels: Sequence[int], shape: tuple[int, ...]) -> np
     array = action.detach().cpu().numpy() if isinstance(action, Tensor) else np.asarray(action)
     most = np.asarray(levels)
     if array.shape != shape or array.dtype.kind not in "iu" or (array < 0).any() or (array >= most).any():
-        raise ValueError(
-            f"action {shown(action)} must hold whole numbers of shape {shape}, from 0 to below {most.tolist()}."
-        )
+        raise ValueError(f"action {shown(action)} must be whole numbers {shape}, from 0 to below {most.tolist()}.")
     return 2.0 * array / (most - 1) - 1.0
 
 

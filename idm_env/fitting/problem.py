@@ -307,9 +307,7 @@ def group_of(episodes: Sequence[Episode], by: str) -> tuple[Tensor, tuple[str, .
     else:
         columns = set.intersection(*(set(e.labels) for e in episodes)) | {"driver", "all", "run_id", "vehicle_id"}
         if by not in columns:
-            raise DataError(
-                f"cannot group by '{by}': no such column that is constant for a driver.{nearest(by, columns)}"
-            )
+            raise DataError(f"cannot group by '{by}': no such column, constant for a driver.{nearest(by, columns)}")
         labels = [e.labels[by] for e in episodes]
     number = {name: i for i, name in enumerate(dict.fromkeys(labels))}
     return torch.tensor([number[label] for label in labels]), tuple(number)

@@ -117,6 +117,8 @@ def in_ranges(task: Any) -> None:
             raise ValueError(f"{field.name} = {shown(value)} must be True or False.")
         if field.name in by_name and not (value is None and field.default is None):
             by_name[field.name].check(field.name, value)
+            if isinstance(value, Real) and not isinstance(value, (int, float)):  # a fraction, or numpy's
+                object.__setattr__(task, field.name, int(value) if isinstance(value, Integral) else float(value))
 
 
 def only_with(task: Any, reward: str, names: Sequence[str]) -> None:

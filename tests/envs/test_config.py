@@ -58,7 +58,7 @@ def test_a_model_comes_back_the_same(tmp_path):
         ({"integration": "eulr"}, "Did you mean 'euler'"),
         ({"configures": "environment"}, "not a model"),
         ({"dt": 0}, "dt = 0 s is outside"),
-        ({"dt": 100}, "dt = 100 s is outside .0, 5. s: no step may be longer than a driver's time gap"),
+        ({"dt": 100}, "dt = 100 s is outside .0, 5. s: no step is longer than a time gap"),
         ({"dt": 2}, "dt = 2 s is longer than the shortest time gap, idm.time_gap = 1.1 s"),
     ],
 )

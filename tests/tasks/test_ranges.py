@@ -5,10 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 import resource
+from fractions import Fraction
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
+import torch
 
 import idm_env  # noqa: F401
 from idm_env.envs.pettingzoo import parallel_env
@@ -30,6 +33,11 @@ ODD: tuple[Any, ...] = (
     [],
     {},
     [1, 2, 3],
+    1j,
+    b"1",
+    np.array(1.0),
+    np.bool_(True),
+    torch.tensor(1.0),
 )
 """What no option takes that is a number."""
 OWN = {"controlled", "max_command"}
@@ -72,6 +80,16 @@ def test_what_lies_outside_is_one_line_and_takes_nothing(name: str) -> None:
     for command in (1e-9, 101.0, math.nan, HUGE, [-101.0, 1.0], [-1.0, math.inf]):
         assert refused(name, "max_command", command).startswith("max_command")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
+
+
+def test_numbers_of_other_libraries_are_numbers_or_one_line() -> None:
+    """Scalars of numpy and fractions are numbers; arrays and tensors without a dimension are none, nor lists."""
+    for length in (np.float32(4.5), Fraction(9, 2)):
+        assert type(make_task("ring", vehicle_length=length).vehicle_length) is float  # type: ignore[attr-defined]
+    assert type(make_task("ring", vehicles=np.int64(9)).vehicles) is int
+    for scalar in (np.array(1.0), torch.tensor(1.0)):
+        for option in ("effects", "dt", "controlled", "noise"):
+            assert refused("ring", option, scalar).startswith(f"{option} = ")
 
 
 @pytest.mark.parametrize(
