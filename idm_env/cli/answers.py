@@ -25,9 +25,8 @@ def show(title: str, rows: list[dict[str, Any]]) -> None:
 
     table = Table(title=title, title_justify="left")
     for name in rows[0]:
-        table.add_column(
-            name.replace("_", " "), overflow="fold", justify="left" if isinstance(rows[0][name], str) else "right"
-        )
+        side: Any = "left" if isinstance(rows[0][name], str) else "right"
+        table.add_column(name.replace("_", " "), overflow="fold", justify=side)
     for row in rows:
         table.add_row(*("–" if v is None else number(v) if isinstance(v, float) else str(v) for v in row.values()))
     Console(**PLAIN).print(table)
@@ -81,9 +80,8 @@ def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> Non
         console.print(laws(result["bases"]), soft_wrap=True, highlight=False)
     files = sorted(result["models"].items(), key=lambda item: item[0] != "model.yaml")
     best = ", which predicts best" if len(files) > 1 else ""
-    console.print(
-        "; ".join(f"{file} is {name}{best if not i else ''}" for i, (file, name) in enumerate(files)), highlight=False
-    )
+    words = (f"{file} is {name}{best if not i else ''}" for i, (file, name) in enumerate(files))
+    console.print("; ".join(words), highlight=False)
     if (out / FOUND).is_file():
         console.print(f"{FOUND} is the shape as an effect, to be used and changed", highlight=False)
     finished(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
@@ -98,11 +96,10 @@ def _error_row(
     row: dict[str, Any] = {"error": f"{name} ({unit})"} | dict(zip(models, (before, after), strict=False))
     if len(models) > 1:
         has_interval = compared is not None and compared["high"] is not None
-        row["change"] = percent(after / before) if before else ""
-        row["95 % interval"] = (
-            f"{percent(compared['low'])} to {percent(compared['high'])}" if compared and has_interval else ""
-        )
-        row["verdict"] = compared["verdict"] if compared else ""
+        change = percent(after / before) if before else ""
+        interval = f"{percent(compared['low'])} to {percent(compared['high'])}" if compared and has_interval else ""
+        verdict = compared["verdict"] if compared else ""
+        row |= {"change": change, "95 % interval": interval, "verdict": verdict}
     return row
 
 

@@ -377,13 +377,11 @@ def _fit_lane_changes(
         source = Source(data, **dataclasses.asdict(file))
         result = fit_lane_changes(source, options, out, on_progress=report)
     shown_of = ("parameter", "symbol", "unit", "estimate", "standard_error", "identified")
-    answers.show(
-        "MOBIL by the likelihood of lane changes", [{n: row[n] for n in shown_of} for row in result["parameters"]]
-    )
+    rows = [{n: row[n] for n in shown_of} for row in result["parameters"]]
+    answers.show("MOBIL by the likelihood of lane changes", rows)
     names = ("model", "parameters", "fitted", "held_out", "mobil_gains", "standard_error")
-    answers.show(
-        "Log-likelihood, of all drivers and of those held out", [{n: r[n] for n in names} for r in result["models"]]
-    )
+    rows = [{n: row[n] for n in names} for row in result["models"]]
+    answers.show("Log-likelihood, of all drivers and of those held out", rows)
     console.print(result["sentence"], soft_wrap=True, highlight=False)
     answers.finished(out, result["data"]["account"])
 
@@ -440,9 +438,8 @@ def explain(
         _work_begins()
         rows: list[dict[str, Any]] = []
         if read is not None:
-            result, models = explain_one(
-                files[0], out, question, resume=job.resume, on_progress=report, trajectories=read
-            )
+            how: dict[str, Any] = {"resume": job.resume, "on_progress": report, "trajectories": read}
+            result, models = explain_one(files[0], out, question, **how)
         else:
             with job.running(report) as run:
                 rows = explain_sets(files, out, question, **run)
@@ -573,12 +570,11 @@ def effects(model: Annotated[Path | None, options.POSITIONAL] = None, cite: bool
             print(line)
         return
     rows = []
+    columns = ("parameter", "symbol", "unit", "default", "null")
     for name, effect in chosen.items():
         summary = (type(effect).__doc__ or "").strip().splitlines()[0]
         for row in table([effect]) or [{"parameter": name, "symbol": "", "unit": "", "default": "", "null": ""}]:
-            keep = {
-                k: str(row[k] if row[k] is not None else "") for k in ("parameter", "symbol", "unit", "default", "null")
-            }
+            keep = {k: "" if row[k] is None else str(row[k]) for k in columns}
             rows.append({**keep, "what": summary})
             summary = ""
     answers.show("Effects", rows)

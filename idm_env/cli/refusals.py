@@ -66,9 +66,8 @@ def refuse_whole(given: Mapping[str, Any]) -> None:
     path = Path(data[0] if isinstance(data, list) else data or "")
     if "columns" not in given or given.get("each") or not path.is_file() or path.suffix in (".yaml", ".yml"):
         return
-    options: dict[str, Any] = {name: given.get(name) for name in ("columns", "ring_length")} | {
-        "layout": given.get("layout", "auto")
-    }
+    options: dict[str, Any] = {name: given.get(name) for name in ("columns", "ring_length")}
+    options["layout"] = given.get("layout", "auto")
     is_filter = "recipe" in given
     if path.stat().st_size > (SMALL_BYTES if is_filter else LARGE_BYTES):
         return

@@ -74,10 +74,8 @@ def numbers(frame: pl.DataFrame, source: str, labels: dict[str, int]) -> tuple[p
         between = (value.is_finite() & ((value - value.round()).abs() > 1e-6)).fill_null(False)
         if between.any():
             row = int(between.arg_true()[0])
-            raise DataError(
-                f"{source}: lane = {value[row]:g} in row {row + 1} is between two lanes. Give a whole number, or an "
-                "empty cell."
-            )
+            fault = f"lane = {value[row]:g} in row {row + 1} is between two lanes"
+            raise DataError(f"{source}: {fault}. Give a whole number, or an empty cell.")
     lane = [pl.col("lane").cast(pl.Float64).round().cast(pl.Int64, strict=False)] if "lane" in frame.columns else []
     present = [name for name in NUMBERS if name in frame.columns]
     frame = frame.with_columns(lane).with_columns(pl.col(present).cast(pl.Float64))
@@ -215,8 +213,7 @@ class Filled:
         if empty or not self.whole:
             fault = f"{listed(empty)} is empty in every row" if empty else f"no row has all of {listed(REQUIRED)}"
             raise DataError(
-                f"{source}: {fault}; fill it: the vehicle, the time in seconds, and the position of the front bumper "
-                "in metres."
+                f"{source}: {fault}; fill it: vehicle, time in seconds, position of the front bumper in metres."
             )
 
 

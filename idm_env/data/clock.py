@@ -75,10 +75,8 @@ def regularise(
     changed = weight > 0
     if changed.any() or len(left) != frame.height:
         same_leader = _same_leader(frame)[left]
-        values = {
-            name: _interpolated(frame[name], left, weight, same_leader if name == "gap_m" else None)
-            for name in frame.columns
-        }
+        same = {"gap_m": same_leader}
+        values = {name: _interpolated(frame[name], left, weight, same.get(name)) for name in frame.columns}
         result = pl.DataFrame(values)
     else:
         result = frame

@@ -75,9 +75,8 @@ def exid(frame: pl.DataFrame, source: str) -> Read:
     frame = frame.with_columns(run.alias("run_id"))
     ahead = frame.select("run_id", "frame", "trackId", "xCenter", "yCenter", "length").rename({"trackId": "leadId"})
     joined = frame.join(ahead, on=["run_id", "frame", "leadId"], how="left", suffix="_lead", maintain_order="left")
-    apart = (
-        (pl.col("xCenter_lead") - pl.col("xCenter")) ** 2 + (pl.col("yCenter_lead") - pl.col("yCenter")) ** 2
-    ).sqrt()
+    dx, dy = (pl.col(f"{name}_lead") - pl.col(name) for name in ("xCenter", "yCenter"))
+    apart = (dx**2 + dy**2).sqrt()
     speed = "lonVelocity" if "lonVelocity" in frame.columns else None
     table = joined.select(
         "run_id",
@@ -168,9 +167,8 @@ def i24(path: Path) -> Read:
     # Vehicles are sampled by their own clocks: one clock for all, so that leaders are measured at the same times.
     table = table.with_columns(pl.col("time_s") - pl.col("time_s").min()).sort(*TRACK, "time_s")
     runs = table["run_id"].unique()
-    table, _ = clock.regularise(
-        table.unique([*TRACK, "time_s"], maintain_order=True), dict.fromkeys(runs, FRAME_S), dict.fromkeys(runs, 0.0)
-    )
+    table = table.unique([*TRACK, "time_s"], maintain_order=True)
+    table, _ = clock.regularise(table, dict.fromkeys(runs, FRAME_S), dict.fromkeys(runs, 0.0))
     return table.drop("step"), repaired("broken document", broken, "documents without a whole track were left out.")
 
 

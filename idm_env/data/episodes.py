@@ -106,9 +106,8 @@ def _valid(
         if out.any():
             vehicles = table.filter(pl.Series(out)).select("run_id", "vehicle_id").n_unique()
             text = f"{out.sum()} rows of {vehicles} drivers {words} were left out."
-            most = (
-                "most rows (is --max-gap too small?), " if wrong is rules[-1][1] and out.sum() > valid.sum() / 2 else ""
-            )
+            is_most = wrong is rules[-1][1] and out.sum() > valid.sum() / 2
+            most = "most rows (is --max-gap too small?), " if is_most else ""
             repairs.append(Repair(most + kind, int(out.sum()), text))
             valid &= ~wrong
     return valid, repairs

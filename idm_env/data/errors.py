@@ -53,9 +53,7 @@ class Counted:
 
     def repairs(self) -> tuple[Repair, ...]:
         """Return the repairs with their sums."""
-        return tuple(
-            Repair(kind, count, text.replace("# ", f"{count} ", 1)) for (kind, text), count in self.found.items()
-        )
+        return tuple(Repair(kind, n, text.replace("# ", f"{n} ", 1)) for (kind, text), n in self.found.items())
 
 
 def nearest(name: str, names: Iterable[str], cutoff: float = 0.5) -> str | None:

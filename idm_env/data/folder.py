@@ -66,9 +66,8 @@ def shares(folder: Path, vehicles: int, columns: Columns = None) -> list[FolderS
         clean.check_runs(scan.filter(_run().is_null()).select("vehicle_id").head(1).collect(), folder.name)
     except (pl.exceptions.PolarsError, OSError) as error:
         raise _unreadable(folder, error) from error
-    runs = vehicles_of_files.group_by("run_id").agg(
-        pl.col("vehicle_id").explode().n_unique().alias("vehicles"), pl.col(_FILE).sort()
-    )
+    number = pl.col("vehicle_id").explode().n_unique().alias("vehicles")
+    runs = vehicles_of_files.group_by("run_id").agg(number, pl.col(_FILE).sort())
     cut: list[FolderSlice] = []
     for run, count, where in runs.sort(natural("run_id"), "run_id").select("run_id", "vehicles", _FILE).rows():
         if cut and cut[-1].vehicles + count <= vehicles:

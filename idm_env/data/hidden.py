@@ -36,32 +36,18 @@ class HiddenStrength:
     half: float
 
 
+_TABLE = (
+    "delay tau_s 0.5 0.25; lag tau_s 0.5 0.25; second_leader weight 0.35 0.175; leader_acceleration gain 0.4 0.2; "
+    "brake_light gain 0.6 0.3; asymmetry k 0.3 0.15; power_limit watt_per_kg 12.0 18.0; drag per_m 5e-4 2.5e-4; "
+    "speed_dependent_gap s1_m 5.0 2.5; memory beta 0.8 0.4; follower gain 0.15 0.075; "
+    "dead_zone rad_per_s 0.002 0.001; action_point mps2 0.3 0.15; grade steepest_slope 0.04 0.02; "
+    "speed_zone factor 0.6 0.8; regime_shift k 0.35 0.175; lateral per_s 0.1 0.05; gap_bias bias_m 1.5 0.75; "
+    "speed_time_gap k -0.4 -0.2; set_point_asymmetry k 0.2 0.1; relaxation beta 0.7 0.35; gap_stiffness w 0.5 0.7; "
+    "speed_profile depth 0.6 0.4; curve_speed mps2 2.0 3.0; leader_trend kappa 0.75 0.87"
+)
 EFFECTS: dict[str, HiddenStrength] = {
-    "delay": HiddenStrength("tau_s", 0.5, 0.25),
-    "lag": HiddenStrength("tau_s", 0.5, 0.25),
-    "second_leader": HiddenStrength("weight", 0.35, 0.175),
-    "leader_acceleration": HiddenStrength("gain", 0.4, 0.2),
-    "brake_light": HiddenStrength("gain", 0.6, 0.3),
-    "asymmetry": HiddenStrength("k", 0.3, 0.15),
-    "power_limit": HiddenStrength("watt_per_kg", 12.0, 18.0),
-    "drag": HiddenStrength("per_m", 5e-4, 2.5e-4),
-    "speed_dependent_gap": HiddenStrength("s1_m", 5.0, 2.5),
-    "memory": HiddenStrength("beta", 0.8, 0.4),
-    "follower": HiddenStrength("gain", 0.15, 0.075),
-    "dead_zone": HiddenStrength("rad_per_s", 0.002, 0.001),
-    "action_point": HiddenStrength("mps2", 0.3, 0.15),
-    "grade": HiddenStrength("steepest_slope", 0.04, 0.02),
-    "speed_zone": HiddenStrength("factor", 0.6, 0.8),
-    "regime_shift": HiddenStrength("k", 0.35, 0.175),
-    "lateral": HiddenStrength("per_s", 0.1, 0.05),
-    "gap_bias": HiddenStrength("bias_m", 1.5, 0.75),
-    "speed_time_gap": HiddenStrength("k", -0.4, -0.2),
-    "set_point_asymmetry": HiddenStrength("k", 0.2, 0.1),
-    "relaxation": HiddenStrength("beta", 0.7, 0.35),
-    "gap_stiffness": HiddenStrength("w", 0.5, 0.7),
-    "speed_profile": HiddenStrength("depth", 0.6, 0.4),
-    "curve_speed": HiddenStrength("mps2", 2.0, 3.0),
-    "leader_trend": HiddenStrength("kappa", 0.75, 0.87),
+    name: HiddenStrength(symbol, float(middle), float(half))
+    for name, symbol, middle, half in (row.split() for row in _TABLE.split(";"))
 }
 """Every effect of the catalogue. ``gap_bias`` changes the measured gap, not the motion."""
 
@@ -202,9 +188,8 @@ def _adapted(view: View, drivers: Drivers, on: dict[str, float]) -> tuple[np.nda
 
 def habit_of(gap: np.ndarray, speed: np.ndarray, drivers: Drivers) -> np.ndarray:
     """Return the gap relative to that of equilibrium, which drivers get used to."""
-    equilibrium = (drivers.min_gap + speed * drivers.time_gap) / np.sqrt(
-        np.maximum(1 - (speed / drivers.desired_speed) ** 4, 0.1)
-    )
+    room = np.maximum(1 - (speed / drivers.desired_speed) ** 4, 0.1)
+    equilibrium = (drivers.min_gap + speed * drivers.time_gap) / np.sqrt(room)
     return np.clip(gap / equilibrium, 0.2, 2.0)
 
 

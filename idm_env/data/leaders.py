@@ -74,7 +74,7 @@ def named(counts: pl.DataFrame, source: str) -> list[Repair]:
     if wrong.height and "there" not in total:
         name = wrong["leader_id"][0]
         raise DataError(
-            f"{source}: leader_id = {name!r} is no other vehicle of its run, as is every leader; check the identifiers."
+            f"{source}: leader_id = {name!r} is no other vehicle of its run, as is every leader; check them."
         )
     repairs = []
     if lost := total.get("lost", 0):

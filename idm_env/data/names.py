@@ -90,10 +90,9 @@ def place(name: str, text: str, columns: list[str], source: str) -> tuple[str, f
     """
     column, unit = text, None
     if match := re.fullmatch(r"(.+?)\s*[\[(]([^\[\]()]+)[\])]", text):
-        has_unit = match[2].strip() in UNITS.get(name, {})
-        column, unit = (
-            (text, match[2].strip() if has_unit else None) if text in columns else (match[1], match[2].strip())
-        )
+        unit = match[2].strip()
+        has_unit = unit in UNITS.get(name, {})
+        column, unit = (text, unit if has_unit else None) if text in columns else (match[1], unit)
     if column not in columns:
         guess = nearest(column, columns)
         cure = f"did you mean {guess!r}?" if guess else f"it has {listed(columns)}."
@@ -132,9 +131,7 @@ def renamed(frame: pl.DataFrame, columns: Columns, source: str) -> tuple[pl.Data
 
 def without_patterns(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     """Return the frame without names that polars reads as patterns: ``*`` is called ``column *``, counted."""
-    names = {
-        name: f"column {name}" for name in frame.columns if name == "*" or re.fullmatch(r"\^.*\$", name, re.DOTALL)
-    }
+    names = {n: f"column {n}" for n in frame.columns if n == "*" or re.fullmatch(r"\^.*\$", n, re.DOTALL)}
     if not names:
         return frame, []
     table = pl.DataFrame([column.alias(names.get(column.name, column.name)) for column in frame])

@@ -24,9 +24,8 @@ def find(table: pl.DataFrame) -> Neighbours:
     """Return the neighbours of every row of a tidy table that also has the integer column ``step``."""
     rows = table.with_row_index("row")
     targets = rows.select("run_id", "step", leader_id="vehicle_id", found="row")
-    joined = rows.select("run_id", "step", "leader_id").join(
-        targets, on=["run_id", "step", "leader_id"], how="left", maintain_order="left"
-    )
+    keys = ["run_id", "step", "leader_id"]
+    joined = rows.select(keys).join(targets, on=keys, how="left", maintain_order="left")
     leader = joined["found"].cast(pl.Int64).fill_null(NONE).to_numpy()
     second = np.where(leader >= 0, leader[leader], NONE)
     return Neighbours(leader, second, _behind(leader, table["gap_m"].to_numpy()), _adjacent(rows, leader))
@@ -49,12 +48,11 @@ def _adjacent(rows: pl.DataFrame, leader: np.ndarray) -> np.ndarray:
         return rows_beside
     nearest = np.full(rows.height, np.inf)
     position = rows["position_m"].to_numpy()
-    others = rows.filter(pl.col("lane").is_not_null()).select("run_id", "step", "lane", "position_m", other="row")
+    laned = rows.filter(pl.col("lane").is_not_null())
+    others = laned.select("run_id", "step", "lane", "position_m", other="row")
     others = others.sort("position_m")
     for side in (-1, 1):
-        mine = rows.filter(pl.col("lane").is_not_null()).select(
-            "run_id", "step", pl.col("lane") + side, "position_m", "row"
-        )
+        mine = laned.select("run_id", "step", pl.col("lane") + side, "position_m", "row")
         pairs = mine.sort("position_m").join_asof(
             others, on="position_m", by=["run_id", "step", "lane"], strategy="nearest", check_sortedness=False
         )

@@ -54,10 +54,8 @@ def read(frame: pl.DataFrame, source: str = "table") -> tuple[pl.DataFrame, list
             raise missing_column(name, frame.columns, source)
     names = [name for name in _NUMBERS if name in frame.columns]
     frame = frame.with_columns(_number(frame, name, source) for name in names)
-    run = (
-        pl.col("location").cast(pl.String).str.strip_chars().fill_null("ngsim") if "location" in frame.columns else None
-    )
-    frame = frame.with_columns((pl.lit("ngsim") if run is None else run).alias("run_id"))
+    place = pl.col("location").cast(pl.String).str.strip_chars().fill_null("ngsim")
+    frame = frame.with_columns((place if "location" in frame.columns else pl.lit("ngsim")).alias("run_id"))
     frame = _with_time(frame, source)
     frame, repairs = _told_apart(frame)
     feet = {"local_y": "position_m", "v_vel": "speed_mps", "v_length": "length_m", "local_x": "lateral_m"}

@@ -61,9 +61,8 @@ def read(frame: pl.DataFrame, lines: list[str], run: str, source: str) -> tuple[
             slots.setdefault(int(match[2]), {})[match[1].lower()] = name
     slots = {slot: names for slot, names in slots.items() if "speed" in names}
     if time is None or not slots:
-        raise DataError(
-            f"{source}: an OpenACC file needs a column Time and at least Speed1; it has {', '.join(frame.columns[:8])}."
-        )
+        has = ", ".join(frame.columns[:8])
+        raise DataError(f"{source}: an OpenACC file needs a column Time and at least Speed1; it has {has}.")
     facts = about(lines)
     repairs: list[Repair] = []
     parts: list[pl.DataFrame] = []

@@ -104,10 +104,8 @@ def _rewritten(path: Path, files: ExitStack) -> Iterable[str] | None:
         shown = ", ".join(cells[:4])
         raise DataError(f"{path.name}: the first line holds numbers, {shown} …: it has no header. Add a line of names.")
     if numbers:
-        rows = [
-            ",".join(re.split(r"[,;\t]|\s+", row.strip()))
-            for row in (" ".join(ngsim.WITHOUT_HEADER[len(cells)]), *rows)
-        ]
+        rows = [" ".join(ngsim.WITHOUT_HEADER[len(cells)]), *rows]
+        rows = [",".join(re.split(r"[,;\t]|\s+", row.strip())) for row in rows]
     if trailing:
         rows = [first, *(row[:-1] for row in rows[1:])]
     return (f"{row.replace(mark, TAB) if mark not in ('', ',', ';') else row}\n" for row in rows)

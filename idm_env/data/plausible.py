@@ -110,9 +110,8 @@ class Jumps:
         if self.first:
             return
         begin = int(np.flatnonzero(np.isfinite(frame["position_m"][:row].to_numpy()))[-1])
-        (_, _, since, before), (run, vehicle, time, after) = (
-            frame.select(*TRACK, "time_s", "position_m").row(n) for n in (begin, row)
-        )
+        rows = frame.select(*TRACK, "time_s", "position_m")
+        (_, _, since, before), (run, vehicle, time, after) = rows.row(begin), rows.row(row)
         jump = f"from {before:g} to {after:g} m within {time - since:.3g} s"
         self.first = f"vehicle {vehicle} of run {run} at t = {time:g} s {jump}"
 

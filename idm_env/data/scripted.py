@@ -13,15 +13,13 @@ VEHICLES_BESIDE = 30
 
 def leaders(random: np.random.Generator, runs: int, steps: int, step: float, cruise: float) -> Scripted:
     """Return leaders that stop and go, cruise, brake sharply and run away for a while, as a smooth speed profile."""
-    speed = np.empty((steps, runs))
+    speed, draw = np.empty((steps, runs)), random.uniform
     for run in range(runs):
         knots, values, now = [0.0], [random.uniform(8.0, 16.0)], 0.0
         while now < steps * step:
             hold = random.uniform(3.0, 15.0)
             kind = random.choice(4, p=[0.25, 0.35, 0.25, 0.15])
-            target = [random.uniform(0.0, 2.0), random.uniform(4.0, 14.0), random.uniform(14.0, cruise), 1.35 * cruise][
-                kind
-            ]
+            target = [draw(0.0, 2.0), draw(4.0, 14.0), draw(14.0, cruise), 1.35 * cruise][kind]
             hold = random.uniform(2.0, 5.0) if kind in (0, 3) else hold
             rate = random.uniform(0.5, 1.6) if target > values[-1] else random.uniform(0.6, 3.0)
             change = abs(target - values[-1]) / rate
@@ -58,9 +56,8 @@ def lapping(random: np.random.Generator, runs: int, steps: int, step: float, cru
         x = x + step * v + 0.5 * step**2 * accel
         v = np.maximum(v + step * accel, 0.0)
     speed = gaussian_filter1d(speed, 0.4 / step, axis=0, mode="nearest")
-    position = position[0] + np.concatenate(
-        [np.zeros((1, runs)), np.cumsum((speed[1:] + speed[:-1]) * (step / 2), axis=0)]
-    )
+    moved = np.cumsum((speed[1:] + speed[:-1]) * (step / 2), axis=0)
+    position = position[0] + np.concatenate([np.zeros((1, runs)), moved])
     return Scripted(position, speed, np.gradient(speed, step, axis=0))
 
 

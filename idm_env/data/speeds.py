@@ -25,9 +25,8 @@ def unwrapped(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     )
     laps = jump.cum_sum().over(schema.TRACK)
     count = int(frame.select(jump.abs().sum()).item())
-    frame = frame.with_columns(
-        (pl.col("position_m") + pl.coalesce(laps * pl.col("ring_length_m"), pl.lit(0.0))).alias("position_m")
-    )
+    driven = pl.coalesce(laps * pl.col("ring_length_m"), pl.lit(0.0))
+    frame = frame.with_columns((pl.col("position_m") + driven).alias("position_m"))
     return frame, repaired("unwrapped", count, "jumps of position at the start of the ring were unwrapped.")
 
 

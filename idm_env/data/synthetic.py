@@ -124,9 +124,8 @@ def _effects(effect: str | Mapping[str, float] | None, strength: str | float) ->
     for name in names:
         if name not in EFFECTS:
             guess = nearest(name, EFFECTS)
-            raise DataError(
-                f"effect = {name!r} is unknown; {f'did you mean {guess!r}?' if guess else ', '.join(EFFECTS)}"
-            )
+            cure = f"did you mean {guess!r}?" if guess else ", ".join(EFFECTS)
+            raise DataError(f"effect = {name!r} is unknown; {cure}")
     if not isinstance(effect, str):
         return {name: float(value) for name, value in effect.items()}
     if isinstance(strength, str):

@@ -94,12 +94,11 @@ class Trajectories:
             raise DataError(f"{self.source}: {column!r} changes along a track; a split needs one value per vehicle.")
         chosen = tracks.filter(pl.col("value") == value.lower())
         if chosen.height == 0:
-            raise DataError(
-                f"{self.source}: no vehicle has {column} = {value!r}; it has {listed(tracks['value'].unique())}."
-            )
+            has = listed(tracks["value"].unique())
+            raise DataError(f"{self.source}: no vehicle has {column} = {value!r}; it has {has}.")
         per_run = tracks.group_by("run_id").agg(pl.col("value").n_unique())["value"]
         if (per_run == 1).all():
-            return self._of_runs(chosen["run_id"].unique().to_list())
+            return self.of_runs(chosen["run_id"].unique().to_list())
         return self._of_drivers(chosen.select(schema.TRACK).rows())
 
     def split(self, held_out: str | float = 0.25, *, seed: int = 0) -> tuple[Trajectories, Trajectories]:
@@ -129,14 +128,13 @@ class Trajectories:
         count = min(max(1, round(fraction * len(items))), len(items) - 1)
         order = np.random.default_rng(seed).permutation(len(items))
         test_items, fit_items = ([items[i] for i in sorted(part)] for part in (order[:count], order[count:]))
-        make = self._of_runs if len(runs) > 1 else self._of_drivers
+        make = self.of_runs if len(runs) > 1 else self._of_drivers
         return make(fit_items), make(test_items)
 
     def followers(self) -> list[tuple[str, str]]:
         """Return (run_id, vehicle_id) of every vehicle that has a leader at some time and is a driver to fit."""
-        rows = (
-            self.table.filter(pl.col("leader_id").is_not_null()).select(schema.TRACK).unique(maintain_order=True).rows()
-        )
+        followers = self.table.filter(pl.col("leader_id").is_not_null())
+        rows = followers.select(schema.TRACK).unique(maintain_order=True).rows()
         return [row for row in rows if self.drivers is None or row in self.drivers]
 
     def name_of(self, run: str, vehicle: str) -> str:
@@ -158,13 +156,14 @@ class Trajectories:
             "repairs": [{"kind": r.kind, "count": r.count, "text": r.text} for r in self.repairs],
         }
 
-    def _of_runs(self, runs: list[str]) -> Trajectories:
+    def of_runs(self, runs: list[str]) -> Trajectories:
+        """Return the part that is of these runs."""
         table = self.table.filter(pl.col("run_id").is_in(runs))
         return replace(self, table=table, steps={run: self.steps[run] for run in runs})
 
     def _of_drivers(self, drivers: list[tuple[str, str]]) -> Trajectories:
         runs = {run for run, _ in drivers}
-        return replace(self._of_runs([run for run in self.runs() if run in runs]), drivers=frozenset(drivers))
+        return replace(self.of_runs([run for run in self.runs() if run in runs]), drivers=frozenset(drivers))
 
     def _without(self, other: Trajectories) -> Trajectories:
         if other.drivers is not None:
@@ -173,7 +172,7 @@ class Trajectories:
         else:
             runs = set(other.runs())
             rest = [run for run in self.runs() if run not in runs]
-            make = self._of_runs  # type: ignore[assignment]
+            make = self.of_runs  # type: ignore[assignment]
         if not rest:
             raise DataError(f"{self.source}: everything would be held out and nothing is left to fit; hold out less.")
         return make(rest)

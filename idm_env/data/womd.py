@@ -120,9 +120,8 @@ def _agent(item: dict[str, Any], number: int) -> Agent:
     # invalid samples are filled with −10 000 in these files
     valid &= np.isfinite(position).all(1) & np.isfinite(velocity).all(1) & np.isfinite(heading)
     length, width = float(_last(item.get("length", 4.5))), float(_last(item.get("width", 2.0)))
-    return Agent(
-        int(item.get("id", number)), str(item["type"]).lower(), length, width, position, heading, velocity, valid
-    )
+    kind = str(item["type"]).lower()
+    return Agent(int(item.get("id", number)), kind, length, width, position, heading, velocity, valid)
 
 
 def _last(value: Any) -> Any:

@@ -69,9 +69,8 @@ def messages() -> dict[str, Any]:
                 entry.type, entry.type_name = kinds.TYPE_MESSAGE, f".idm_env.womd.{plain}"
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    return {
-        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"idm_env.womd.{name}")) for name in MESSAGES
-    }
+    kinds = {name: pool.FindMessageTypeByName(f"idm_env.womd.{name}") for name in MESSAGES}
+    return {name: message_factory.GetMessageClass(kind) for name, kind in kinds.items()}
 
 
 def read(path: str | Path) -> Iterator[Scenario]:
@@ -84,9 +83,8 @@ def read(path: str | Path) -> Iterator[Scenario]:
         try:
             message.ParseFromString(data)
         except DecodeError:
-            raise DataError(
-                f"{path.name}: record {number} is no scenario.proto; use files of scenarios, not of tf.Examples."
-            ) from None
+            fault = f"{path.name}: record {number} is no scenario.proto"
+            raise DataError(f"{fault}; use files of scenarios, not of tf.Examples.") from None
         yield _scenario(message, f"{path.name}, record {number}")
 
 

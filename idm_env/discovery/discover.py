@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from idm_env.data import Trajectories, episodes
+from idm_env.data.recorders import on_one_clock
 from idm_env.discovery import calibrate, judge, march, model as terms, records, search
 from idm_env.discovery.finish import Discovery, finished
 from idm_env.discovery.judgement import Evaluation
@@ -78,6 +79,7 @@ def discover(
     progress = on_progress or silent
     law = base_named(base) if isinstance(base, str) else base
     chosen = _chosen(effects, known)
+    trajectories = on_one_clock(trajectories)
     prepared = prepare(trajectories, by, place)
     refused = terms.testable(prepared, chosen)
     tried = [_measured(prepared, e) for e in chosen if e.name not in refused and e.name not in known]

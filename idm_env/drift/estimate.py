@@ -285,9 +285,8 @@ def predicted(path: Path, settings: DriftSettings, dt: float, mean: np.ndarray, 
     level[1:, :, own:] = np.clip(decay * mean[:-1, :, 2 + own :], -reach, reach)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)[:-1, :, 2 + own :]
     unsure[1:] = np.sqrt(settings.sigma**2 + decay**2 * (np.maximum(variance, 0.0) - settings.sigma**2))
-    return replace(
-        path, gap=np.maximum(mean[..., 0], 0.2), speed=np.maximum(mean[..., 1], 0.0), level=level, unsure=unsure
-    )
+    gap, speed = np.maximum(mean[..., 0], 0.2), np.maximum(mean[..., 1], 0.0)
+    return replace(path, gap=gap, speed=speed, level=level, unsure=unsure)
 
 
 def _errors(around: Likelihood, settings: DriftSettings, limits: np.ndarray) -> np.ndarray:

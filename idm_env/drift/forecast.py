@@ -46,10 +46,8 @@ def draw_gaps(
     end of a record a future means nothing.
     """
     steps = round(seconds / drivers.batch.dt)
-    chunks = [
-        _chunk(drivers, settings, theta, levels, starts[i : i + 64], steps, count, seed + i)
-        for i in range(0, len(starts), 64)
-    ]
+    some = range(0, len(starts), 64)
+    chunks = [_chunk(drivers, settings, theta, levels, starts[i : i + 64], steps, count, seed + i) for i in some]
     gap, speed = (np.concatenate(x, -1) for x in zip(*chunks, strict=True))
     return gap, speed
 
@@ -101,15 +99,6 @@ def crps(drawn: np.ndarray, truth: np.ndarray) -> np.ndarray:
     ranked = np.sort(drawn, 0)
     weight = (2.0 * np.arange(1, n + 1) - n - 1.0).reshape(-1, *(1,) * truth.ndim)
     return np.asarray(first - (weight * ranked).sum(0) / (n * (n - 1.0)))
-
-
-def log_score(drawn: np.ndarray, truth: np.ndarray, least: float = 0.1) -> np.ndarray:
-    """Return minus the log density of the truth under a normal of the draws' mean and variance: small is good.
-
-    ``least`` is added as a standard deviation, since all draws may agree that a car stands.
-    """
-    variance = drawn.var(0, ddof=1) + least**2
-    return np.asarray(0.5 * (math.log(2.0 * math.pi) + np.log(variance) + (truth - drawn.mean(0)) ** 2 / variance))
 
 
 def covers(drawn: np.ndarray, truth: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:

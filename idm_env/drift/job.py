@@ -103,10 +103,8 @@ def model_of(estimate: Estimate) -> Model:
         return nested(dict(zip(names, np.exp(row).tolist(), strict=True)))
 
     s = estimate.settings
-    drifts = {
-        name: {"sigma": float(s.sigma[j]), "memory_time": float(s.memory_time[j])}
-        for j, name in enumerate(drivers.drifts)
-    }
+    numbers_of = zip(drivers.drifts, s.sigma.tolist(), s.memory_time.tolist(), strict=True)
+    drifts = {name: {"sigma": sigma, "memory_time": tau} for name, sigma, tau in numbers_of}
     records: dict[str, list[np.ndarray]] = {}
     for e, theta in zip(drivers.batch.episodes, estimate.theta, strict=True):
         records.setdefault(f"{e.run_id}/{e.vehicle_id}", []).append(theta)

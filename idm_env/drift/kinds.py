@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 
@@ -76,9 +77,8 @@ class _Sort:
 
 
 def _estimated(sort: _Sort, progress: OnProgress) -> dict[str, Tensor]:
-    return estimate(
-        sort.simulator, sort.smooth, IDM_NAMES, usual(IDM_NAMES), measured=sort.measured, noise=sort.noise
-    ).numbers()
+    more: Any = {"measured": sort.measured, "noise": sort.noise}
+    return estimate(sort.simulator, sort.smooth, IDM_NAMES, usual(IDM_NAMES), **more).numbers()
 
 
 def tell(

@@ -29,10 +29,9 @@ def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]
     near = np.isfinite(filtered.gap) & (filtered.gap > 0) & (filtered.gap < FARTHEST_M)
     for begin, end in _stretches(filtered.leader, near):
         for lead in leaders.get((filtered.track.run_id, str(filtered.leader[begin])), ()):
-            inside = (clock[begin:end] >= lead.motion.time_s[0] - 1e-9) & (
-                clock[begin:end] <= lead.motion.time_s[-1] + 1e-9
-            )
-            if inside.all() and (longest is None or end - begin > longest[1] - longest[0]):
+            first, last = lead.motion.time_s[[0, -1]]
+            inside = clock[begin] >= first - 1e-9 and clock[end - 1] <= last + 1e-9
+            if inside and (longest is None or end - begin > longest[1] - longest[0]):
                 longest = begin, end, lead
     if longest is None or (longest[1] - longest[0]) * dt < SHORTEST_S:
         return None
@@ -41,14 +40,9 @@ def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]
     time = clock[part]
     position, speed = filtered.motion.position_m[part], filtered.motion.speed_mps[part]
     length = lead.track.length_m
-    ahead = VehicleRecord(
-        position + filtered.gap[part] + length,
-        np.interp(time, lead.motion.time_s, lead.motion.speed_mps),
-        np.interp(time, lead.motion.time_s, lead.motion.accel_mps2),
-        length,
-        np.ones(end - begin, bool),
-    )
     nobody = np.zeros(end - begin, bool)
+    speeds, accels = (np.interp(time, lead.motion.time_s, x) for x in (lead.motion.speed_mps, lead.motion.accel_mps2))
+    ahead = VehicleRecord(position + filtered.gap[part] + length, speeds, accels, length, ~nobody)
     far = [VehicleRecord(position + away, speed, np.zeros(end - begin), 4.5, nobody) for away in (FAR_M, -FAR_M, FAR_M)]
     track = filtered.track
     return Episode(

@@ -113,9 +113,8 @@ def _run(
 ) -> dict[str, Any]:
     progress("reading", 0, 0, path.name)
     model = None if settings.model is None else Path(settings.model)
-    parts = Parts(
-        out / storage.UNFINISHED / settings.task, storage.fingerprint(settings, how, stamp(path), model), resume
-    )
+    mark = storage.fingerprint(settings, how, stamp(path), model)
+    parts = Parts(out / storage.UNFINISHED / settings.task, mark, resume)
     try:
         spool = Spool(path, parts.folder / "spool", how.layout, settings.chunk, how.ring_length, how.columns)
         bridge = 2.0 if settings.task == "filter" else None
@@ -134,9 +133,8 @@ def _run(
     parts.join(PARAMETERS, out / "parameters.parquet")
     report = _report(spool, summaries, settings, plan) | {"left_out_points": scored}
     figures = pictures.space_time(out / "trajectories.parquet", spool, bridge)
-    write_report(
-        out, report, _shown(out, spool, bridge), pl.read_parquet(out / "parameters.parquet", glob=False), figures
-    )
+    parameters = pl.read_parquet(out / "parameters.parquet", glob=False)
+    write_report(out, report, _shown(out, spool, bridge), parameters, figures)
     parts.remove()
     return report
 

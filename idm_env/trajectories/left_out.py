@@ -29,9 +29,8 @@ def score(spool: Spool, plan: FilePlan, settings: FilterSettings) -> list[dict[s
 
     Tracks of fewer than five points are not scored; no row if there is no other.
     """
-    tracks = [
-        t for table in spool.picked(_sample_vehicles(len(spool.vehicles))) for t in Pieces(table, None) if len(t) >= 5
-    ]
+    tables = spool.picked(_sample_vehicles(len(spool.vehicles)))
+    tracks = [t for table in tables for t in Pieces(table, None) if len(t) >= 5]
     if not tracks:
         return []
     halves, out = zip(*(thinned(track) for track in tracks), strict=True)

@@ -115,9 +115,8 @@ def _imitated(
     gap = torch.full((max(len(clock) for clock in clocks), len(tracks), 1), 10.0, dtype=torch.float64)
     bounds = {"imagined.gap": GAP_BOUNDS, "imagined.closing_speed": CLOSING_BOUNDS} | ({} if fixed else FIVE)
     ahead = Imagined(gap, torch.zeros_like(gap))
-    driven = _descended(
-        ImaginedLeader(), ahead, np.tile(START, (len(tracks), 1)), speed0, dt, steps, targets, bounds, iterations
-    )
+    start = np.tile(START, (len(tracks), 1))
+    driven = _descended(ImaginedLeader(), ahead, start, speed0, dt, steps, targets, bounds, iterations)
     values = np.stack([driven.params[f"idm.{name}"] for name in NAMES], axis=-1)
     fits = []
     for i, (track, clock) in enumerate(zip(tracks, clocks, strict=True)):
@@ -149,9 +148,8 @@ def follow(
 
 def drive(values: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float) -> np.ndarray:
     """Return the distances [K] that the five values drive from 0 at ``speed0``, behind a leader as in ``follow``."""
-    return _descended(RealLeader(), _record_ahead(rear_m, pace), values[None], [speed0], dt, [], [], {}, 0).position[
-        :-1, 0
-    ]
+    ahead = _record_ahead(rear_m, pace)
+    return _descended(RealLeader(), ahead, values[None], [speed0], dt, [], [], {}, 0).position[:-1, 0]
 
 
 def _record_ahead(rear_m: np.ndarray, pace: np.ndarray) -> Ahead:

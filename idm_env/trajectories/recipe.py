@@ -102,10 +102,8 @@ def recipe(
     of this chunk, this chunk's track gives way.
     """
     clocks = [clock_of(track, dt) for track in tracks]
-    observed = [
-        TrackObservations.on_clock(track.time_s, track.position_m, dt, len(clock))
-        for track, clock in zip(tracks, clocks, strict=True)
-    ]
+    pairs = zip(tracks, clocks, strict=True)
+    observed = [TrackObservations.on_clock(t.time_s, t.position_m, dt, len(clock)) for t, clock in pairs]
     smoothed = _smoothed(observed, noise, options)
     around = Neighbourhood([*tracks, *(f.track for f in before)], [*clocks, *(f.motion.time_s for f in before)])
     meetings = list(around.meetings())

@@ -67,30 +67,22 @@ def write_report(
 
 def _lead(report: dict[str, Any]) -> str:
     lost = len(report["left_out"])
-    words = (
-        f"{report['tracks']} tracks of {report['vehicles']} vehicles, one result every {report['settings']['dt']} s."
-    )
+    words = f"{report['tracks']} tracks of {report['vehicles']} vehicles, one every {report['settings']['dt']} s."
     return f"{words} {f'{lost} tracks were left out (below).' if lost else 'No track was left out.'}"
 
 
 def _noise(noise: dict[str, float]) -> str:
-    words = (
-        f"Fitted to this file: white noise {noise['white']:.3f} m, correlated noise {noise['sigma']:.3f} m over "
-        f"{noise['time']:.2f} s, jerk density {noise['jerk']:.3g} m²/s⁵"
-    )
+    words = f"Fitted to this file: white noise {noise['white']:.3f} m, correlated noise {noise['sigma']:.3f} m over "
+    words += f"{noise['time']:.2f} s, jerk density {noise['jerk']:.3g} m²/s⁵"
     return words + (f", accelerations fade in {noise['accel_time']:.2f} s." if noise["accel_time"] else ".")
 
 
 def _left_out_points(rows: Sequence[dict[str, Any]]) -> list[page.Block]:
     """Return how far the methods are from points of the file that they were not given."""
     ours, line = rows[0], next((row for row in rows if row["method"] == "linear"), None)
-    words = (
-        f"Every second point of {ours['tracks']} tracks was left out, {ours['points']} in all, "
-        f"and reconstructed from the others, {ours['spacing_s']:.3g} s apart: root mean square error "
-        f"{ours['rmse_m']:.2f} m"
-    )
-    if line is not None:
-        words += f", straight lines {line['rmse_m']:.2f} m"
+    words = f"Every second point of {ours['tracks']} tracks was left out, {ours['points']} in all, and reconstructed "
+    words += f"from the others, {ours['spacing_s']:.3g} s apart: root mean square error {ours['rmse_m']:.2f} m"
+    words += "" if line is None else f", straight lines {line['rmse_m']:.2f} m"
     table = [
         {
             "method": row["method"], "RMSE (m)": row["rmse_m"], "mean |error| (m)": row["mae_m"],
@@ -139,9 +131,8 @@ def before_and_after(track: TrackPiece, motion: RegularMotion) -> Figure:
         change = np.diff(speed) / step[1:]
         # differences of noisy data go far beyond the picture: thin, so that they stay behind
         thin = float(np.median(np.abs(change))) > 4.0
-        axes[2].plot(
-            middle[:-1] + step[1:] / 2, change, color=BEFORE, lw=0.4 if thin else 1.0, alpha=0.5 if thin else 1.0
-        )
+        width, alpha = (0.4, 0.5) if thin else (1.0, 1.0)
+        axes[2].plot(middle[:-1] + step[1:] / 2, change, color=BEFORE, lw=width, alpha=alpha)
     axes[2].plot(clock, motion.accel_mps2, color=AFTER, lw=1.5)
     low, high = min(-4.0, motion.accel_mps2.min() - 1), max(4.0, motion.accel_mps2.max() + 1)
     axes[2].set(ylabel="acceleration (m/s²)", xlabel="time (s)", ylim=(low, high))
@@ -185,8 +176,7 @@ def parameter_histograms(parameters: pl.DataFrame) -> Figure:
         axis.set_xlabel(f"{p.symbol}: {p.name.replace('_', ' ')} ({p.unit})", fontsize=9)
         axis.tick_params(labelsize=8)
     figure.axes[0].set_ylabel("tracks", fontsize=9)
-    handles = {
-        label: handle for axis in figure.axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-    }
+    shown = (zip(*axis.get_legend_handles_labels(), strict=True) for axis in figure.axes)
+    handles = {label: handle for pairs in shown for handle, label in pairs}
     figure.legend(handles.values(), handles.keys(), loc="outside upper right", frameon=False, fontsize=9, ncols=2)
     return figure

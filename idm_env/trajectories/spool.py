@@ -187,9 +187,8 @@ class Spool:
             files.append(self.folder / f"ticks-{chunk:05d}.parquet")
             storage.write(files[-1], ticks.with_columns(pl.lit(chunk).alias("chunk")).write_parquet)
         if named:
-            self._counted.add(
-                leaders.named(pl.concat(named).group_by("leader_id", "state").agg(pl.col("len").sum()), self.source)
-            )
+            counts = pl.concat(named).group_by("leader_id", "state").agg(pl.col("len").sum())
+            self._counted.add(leaders.named(counts, self.source))
         count = max(1, -(-int(index["rows"].sum()) // BUCKET_ROWS))
         times = self._partition(files, "times", pl.struct("run_id", "step").hash(seed=0) % count)
         files = []

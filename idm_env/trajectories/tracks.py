@@ -87,9 +87,8 @@ class Pieces:
         frame = table.frame
         self._columns = {name: frame[name].to_numpy() for name in ("time_s", "position_m")}
         self._leader = frame["leader_id"].to_numpy()
-        self._lane = (
-            frame["lane"].fill_null(-1).to_numpy() if "lane" in frame.columns else np.full(frame.height, -1, np.int64)
-        )
+        nowhere = np.full(frame.height, -1, np.int64)
+        self._lane = frame["lane"].fill_null(-1).to_numpy() if "lane" in frame.columns else nowhere
         self._length = frame["length_m"].to_numpy()
         self.vehicles = table.vehicles()
 

@@ -1,0 +1,57 @@
+"""Clocks of recorders that are apart are put together; the delays of drivers are not taken for clocks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+
+from idm_env.data import Trajectories, synthetic
+from idm_env.data.recorders import clock_offsets, on_one_clock
+from tests.data.tables import kinds
+
+OFFSETS = {"1": 0.0, "2": 0.3, "3": -0.3, "4": 0.3}
+
+
+def platoons(effect: str | None = None) -> Trajectories:
+    return synthetic.generate(1, runs=6, seconds=100.0, effect=effect, noise=0.1)[0]
+
+
+def apart(trajectories: Trajectories) -> Trajectories:
+    """The same platoons, every car with a logger of its own clock."""
+    seconds = pl.col("vehicle_id").replace_strict(OFFSETS, return_dtype=pl.Float64)
+    table = trajectories.table.drop("gap_m", "gap_measured").with_columns((pl.col("time_s") + seconds).round(3))
+    return Trajectories.from_frame(table)
+
+
+def test_loggers_of_several_clocks_are_put_on_one() -> None:
+    """To 0.1 s, which leaves gaps as they were to 1.5 m where they were off by 12 m; said and counted."""
+    truth, measured = platoons(), apart(platoons())
+    offsets = clock_offsets(measured)
+    assert len(offsets) == 18
+    assert all(abs(seconds - OFFSETS[vehicle]) < 0.1 for (_, vehicle), seconds in offsets.items())
+    together = on_one_clock(measured)
+    assert kinds(together.repairs)["clocks apart"] == 18
+    assert any("0.6 s apart" in repair.text for repair in together.repairs)
+
+    def errors(some: Trajectories) -> np.ndarray:
+        keys = ["run_id", "vehicle_id", "tick"]
+        a, b = (x.table.with_columns((10 * pl.col("time_s")).round().alias("tick")) for x in (some, truth))
+        both = a.join(b, on=keys, suffix="_true").drop_nulls(["gap_m", "gap_m_true"])
+        return np.abs(both["gap_m"] - both["gap_m_true"]).to_numpy()
+
+    assert errors(measured).max() > 8.0 and errors(together).max() < 2.5
+
+
+@pytest.mark.parametrize("effect", [None, "delay", "second_leader", "brake_light"])
+def test_one_clock_stays_as_it_is_whatever_drivers_do(effect: str | None) -> None:
+    trajectories = platoons(effect)
+    assert clock_offsets(trajectories) == {} and on_one_clock(trajectories) is trajectories
+
+
+def test_nobody_behind_a_follower_tells_no_clock() -> None:
+    measured = apart(platoons())
+    few = replace(measured, table=measured.table.filter(pl.col("vehicle_id").is_in(["1", "2"])))
+    assert clock_offsets(few) == {}
