@@ -104,7 +104,7 @@ def test_of_a_single_driver_nothing_is_foreseen() -> None:
 def test_nothing_is_not_said_of_an_effect_without_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Closing speeds count double above 2 m/s: no candidate has that shape, and something is missing.
 
-    Strengths of the drivers' own, which take half of it, are not tried.
+    Strengths of the drivers' own, which take half of it, are not named.
     """
     usual = hidden._desired_gap
 
@@ -114,7 +114,7 @@ def test_nothing_is_not_said_of_an_effect_without_a_name(monkeypatch: pytest.Mon
     monkeypatch.setattr(hidden, "_desired_gap", doubled)
     made, _ = synthetic.generate(83)
     monkeypatch.undo()
-    monkeypatch.setattr(bases, "OWN", dict.fromkeys(bases.OWN, 1.0))
+    monkeypatch.setattr(bases.Law, "is_better", False)
     found = discover(made, effects=["drag"])
     told = found.report["ladder"]
     assert found.verdict is Verdict.UNEXPLAINED, found.report["sentence"]
