@@ -61,9 +61,9 @@ def test_actions_may_be_whole_numbers_in_every_face() -> None:
             other = box.step(np.array(number, np.float32))
             np.testing.assert_array_equal(first[0], other[0])
         assert env.unwrapped.state.lanes.lane.tolist() == box.unwrapped.state.lanes.lane.tolist()
-    with pytest.raises(ValueError, match="must hold whole numbers"):
+    with pytest.raises(ValueError, match="must be whole numbers"):
         env.step(np.array([0, 1, 2, 3]))
-    with pytest.raises(ValueError, match="must hold whole numbers"):
+    with pytest.raises(ValueError, match="must be whole numbers"):
         env.step(np.array([0.0, 1.0, 2.0, 0.0]))
     with pytest.raises(ValueError, match="discrete = 1 leaves agents no choice"):
         make_task("highway", discrete=1)
