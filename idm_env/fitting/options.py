@@ -10,6 +10,7 @@ from idm_env.data import LEADER_LOST_GAP_M, Episodes, Trajectories, episodes, lo
 from idm_env.data.episode import windows
 from idm_env.data.folder import FolderSlice
 from idm_env.data.names import Columns
+from idm_env.data.recorders import on_one_clock
 from idm_env.effects import Effect, Replay, base_named
 from idm_env.fitting.fit import Method, base_simulator
 from idm_env.fitting.problem import Loss, Objective
@@ -40,14 +41,14 @@ class Source:
     columns: Columns = None
 
     def trajectories(self, share: FolderSlice | None = None) -> Trajectories:
-        """Read and check the file, or a ``share`` of the folder."""
+        """Read and check the file, or a ``share`` of the folder; recorders whose clocks are apart are put on one."""
         if share is not None:
             read = share.trajectories(ring_length=self.ring_length, place=self.place)
         else:
             read = load(
                 self.path, ring_length=self.ring_length, place=self.place, layout=self.layout, columns=self.columns
             )
-        return read if self.where is None else read.where(self.where)
+        return on_one_clock(read if self.where is None else read.where(self.where))
 
     def episodes(self, trajectories: Trajectories) -> Episodes:
         """Return the drivers behind leaders, cut to windows where asked."""
