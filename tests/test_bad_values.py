@@ -23,7 +23,7 @@ from hypothesis import example, given, settings, strategies as st
 import idm_env  # noqa: F401
 from agents import apg, common
 from agents.policy import Policy
-from idm_env import validation
+from idm_env import effects, validation
 from idm_env.cli import commands as cli
 from idm_env.data import sizes, synthetic
 from idm_env.envs import window
@@ -223,6 +223,19 @@ def test_a_value_in_an_error_text_is_short_however_it_grows() -> None:
         laughs = [laughs] * 9
     for value in (laughs, 10**5000, "x" * 10**7, {"a": laughs}):
         assert len(validation.shown(value)) < 700
+
+
+@pytest.mark.parametrize(
+    "value", [math.nan, "abc", "", True, [1, 2], {}, 1j, b"1", np.array(1.0), torch.tensor(1.0), int]
+)
+@pytest.mark.parametrize(
+    ("effect", "choice"), [(effects.IDM, "exponent"), (effects.Brakes, "width"), (effects.Curve, "number"),
+                           (effects.Curve, "period"), (effects.Mobil, "every"), (effects.SpeedZone, "width")],
+)  # fmt: skip
+def test_a_choice_of_another_type_is_refused_where_an_effect_is_made(effect: Any, choice: str, value: Any) -> None:
+    """All were taken, or ended in another library's words in the first step."""
+    with pytest.raises(ValueError, match=rf"^{effect.kind}\.{choice} = .* must be of type "):
+        effect(**{choice: value})
 
 
 # -- environments ----------------------------------------------------------------------------------------------------

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
+from dataclasses import dataclass, fields, is_dataclass
+from numbers import Integral, Real
+from typing import Any, ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -16,6 +17,10 @@ from torch import Tensor
 from idm_env.effects.watched import RETURNS, watched
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Mark, Motion, Scene, Wish
+from idm_env.validation import shown
+
+CHOICES: dict[str, type] = {"float": Real, "int": Integral, "bool": bool, "str": str}
+"""Types of choices that are checked where an effect is made."""
 
 Hook = Literal["perceive", "adapt", "accelerate", "limit", "place", "change"]
 HOOKS: tuple[Hook, ...] = ("perceive", "adapt", "accelerate", "limit", "place", "change")
@@ -111,6 +116,17 @@ class Effect:
     per_driver: ClassVar[bool] = False
     column: ClassVar[str] = ""
 
+    def __new__(cls, *choices: Any, **named: Any) -> Any:
+        """Return an effect. ValueError, in one line, for a number, truth value or text that its choices do not take."""
+        values = dict(zip(getattr(cls, "__match_args__", ()), choices, strict=False)) | named
+        for field in fields(cls) if is_dataclass(cls) else ():
+            kind, value = str(field.type).removesuffix(" | None"), values.get(field.name, field.default)
+            if kind not in CHOICES or value is field.default or (value is None and kind != field.type):
+                continue
+            if isinstance(value, bool) != (kind == "bool") or not isinstance(value, CHOICES[kind]) or value != value:
+                raise ValueError(f"{cls.kind}.{field.name} = {shown(value)} must be of type {kind}, and no NaN.")
+        return super().__new__(cls)
+
     def __init_subclass__(cls) -> None:
         mine = [hook for hook in HOOKS if getattr(cls, hook) is not getattr(Effect, hook)]
         if len(mine) != 1:
@@ -120,8 +136,7 @@ class Effect:
         cls.hook = mine[0]
         if cls.kind and not re.fullmatch(r"[\w-]+", cls.kind):
             raise TypeError(
-                f"effect {cls.__name__}: kind = {cls.kind!r} names files and columns. Take letters, digits, '_' and "
-                "'-'."
+                f"effect {cls.__name__}: kind = {cls.kind!r} names files and columns. Take letters, digits, _ and -."
             )
         if unknown := cls.needs - NEEDED:
             raise TypeError(
