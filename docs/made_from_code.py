@@ -204,7 +204,7 @@ def _meaning(function: Any) -> str:
     return text.replace("``", "`").replace("|", "\\|")
 
 
-MEASURED = {"highway": "2026-11-26", "platoon": "2026-11-27", "follow": "2026-11-27"}
+MEASURED = {"highway": "2026-11-26", **dict.fromkeys(("ring", "follow", "platoon"), "2026-11-27")}
 """When tables of skill were measured, where not on 2026-11-25."""
 
 
