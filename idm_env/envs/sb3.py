@@ -46,7 +46,7 @@ class SB3VecEnv(VecEnv):
         options = self._options[0] if self._options and self._options[0] else None
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         observation, info = self.vector_env.reset(seed=seeds, options=options)  # type: ignore[arg-type]
-        self.reset_infos = single_infos(info, self.num_envs)
+        self.reset_infos = single_infos(info, self.vector_env.num_envs)
         self._reset_seeds()
         self._reset_options()
         return np.asarray(observation)
@@ -59,10 +59,10 @@ class SB3VecEnv(VecEnv):
         """Step, and reset what ended; return observations, rewards, dones and one info per environment."""
         observation, reward, terminated, truncated, info = self.vector_env.step(self._actions)
         done = terminated | truncated
-        infos = single_infos(info, self.num_envs)
+        infos = single_infos(info, self.vector_env.num_envs)
         if done.any():
             last = info["final_obs"] if self._same_step else observation
-            final = single_infos(info["final_info"], self.num_envs) if self._same_step else infos
+            final = single_infos(info["final_info"], self.vector_env.num_envs) if self._same_step else infos
             for i in np.flatnonzero(done).tolist():
                 if self._same_step:
                     self.reset_infos[i], infos[i] = infos[i], final[i]
@@ -70,7 +70,7 @@ class SB3VecEnv(VecEnv):
                 infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
             if not self._same_step:
                 observation, fresh = self.vector_env.reset(options={"reset_mask": done})
-                begun = single_infos(fresh, self.num_envs)
+                begun = single_infos(fresh, self.vector_env.num_envs)
                 self.reset_infos = [begun[i] if ended else self.reset_infos[i] for i, ended in enumerate(done)]
         return np.asarray(observation), np.asarray(reward, np.float32), done, infos
 
