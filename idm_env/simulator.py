@@ -109,16 +109,16 @@ class Simulator(CarFollowingStep):
         instead of ``steps``, for about one more forward pass. ``seed`` draws the normals that no input
         gives (``drawn``). ValueError for inputs that are too short or of no effect.
         """
+        parameters.whole("steps", steps, 1)
         if seed is not None:
             inputs = self.drawn(state.speed, inputs, steps, seed)
-        if steps > 0 and keep in (_trajectory, None):
+        if keep in (_trajectory, None):
             self._covered(inputs, steps)
             self.tried(state, inputs, params)
             fast = backends.rollout(self, state, inputs, params, steps, checkpoint_every, keep is not None)
             # NaN that an effect of one's own has made is told by the step itself.
             if fast is not None and not (self.own and bool(fast[0].speed.isnan().any())):
-                last, columns = fast
-                return last, None if columns is None else Trajectory(*columns)
+                return fast[0], None if fast[1] is None else Trajectory(*fast[1])
         slices = self.slices(inputs, steps)
 
         def run(state: State, begin: int, end: int) -> tuple[State, list[tuple[Tensor, ...]]]:
@@ -137,13 +137,10 @@ class Simulator(CarFollowingStep):
             else:
                 state, part = run(state, begin, end)
             samples += part
-        if not samples:
-            raise ValueError(f"steps = {steps}: a rollout needs at least one step.")
         if keep is None:
             return state, None
         columns = (torch.stack(column) for column in zip(*samples, strict=True))
-        first = samples[0]
-        return state, type(first)(*columns) if hasattr(first, "_fields") else tuple(columns)
+        return state, type(samples[0])(*columns) if hasattr(samples[0], "_fields") else tuple(columns)
 
     @property
     def untried(self) -> bool:

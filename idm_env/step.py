@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, TypeVar
@@ -45,7 +45,8 @@ class CarFollowingStep:
     Where an effect can add to what the driver wants, the sum is held to what tyres can (``effects.Traction``, by its
     default unless it is named).
 
-    ValueError: two effects of one name, not exactly one car-following effect, or a step longer than any time gap.
+    ValueError: what is no road or no effect, two effects of one name, not exactly one car-following effect, or a step
+    longer than any time gap.
     """
 
     road: Road
@@ -54,16 +55,20 @@ class CarFollowingStep:
     integration: Integration = "ballistic"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "effects", tuple(self.effects))
-        names = [e.name for e in self.effects]
-        double = {n for n in names if names.count(n) > 1}
-        if double:
-            raise ValueError(f"effect '{double.pop()}' is given twice. Every effect of a simulator needs its own name.")
+        if isinstance(self.road, type) or not hasattr(self.road, "beside"):
+            raise ValueError(f"road: {type(self.road).__name__} is no road. Take Ring(230.0), Lane() or Lanes(2).")
+        effects = self.effects if isinstance(self.effects, Iterable) else (self.effects,)
+        object.__setattr__(self, "effects", tuple(effects))
         for e in self.effects:
+            if isinstance(e, type) or not hasattr(e, "hook"):
+                raise ValueError(f"effects: {type(e).__name__} is no effect. Take instances, such as Brakes().")
             who = f"effect '{e.name}': {type(e).__name__}"
             parameters.at_least(f"{who}.looks_back", e.looks_back, 0.0, "s", 3600.0)
             parameters.at_least(f"{who}.decides_every", e.decides_every, 0.0, "s", 3600.0)
             parameters.whole(f"{who}.decides_in_blocks", e.decides_in_blocks, 0, 10**9)
+        names = [e.name for e in self.effects]
+        if double := {n for n in names if names.count(n) > 1}:
+            raise ValueError(f"effect '{double.pop()}' is given twice. Every effect of a simulator needs its own name.")
         following = [e.name for e in self.effects if isinstance(e, CarFollowing)]
         if len(following) != 1:
             raise ValueError(
@@ -75,6 +80,7 @@ class CarFollowingStep:
         parameters.one_of("integration", self.integration, INTEGRATORS)
         if self.decides_in_blocks and self.sees_mergers:
             raise ValueError("who takes turns to decide does not see who signals: leave stagger or that effect out.")
+        parameters.at_least("dt", self.dt, 0.0, "s")
         longest = next((p.high for p in self._following.parameters if p.name == "time_gap"), float("inf"))
         if not 0.0 < self.dt <= longest:
             raise ValueError(f"dt = {self.dt:g} s is outside (0, {longest:g}] s: no step is longer than a time gap.")

@@ -28,9 +28,8 @@ def shown(value: Any) -> str:
 def nearest(word: str, words: Iterable[str]) -> str:
     """Return ' Did you mean …?' for the nearest known word; when none is near, all words, or the best of many."""
     words, word = list(dict.fromkeys(words)), word[:200]
-    longer = [
-        k for k in words if len(word) > 2 and k.startswith(word)
-    ]  # a name cut short is nearer than one misspelled
+    # A name cut short is nearer than one misspelled.
+    longer = [k for k in words if len(word) > 2 and k.startswith(word)]
     close = longer if len(longer) == 1 else difflib.get_close_matches(word, words, n=1, cutoff=0.5)
     if not close and "." in word:
         close = difflib.get_close_matches(word.split(".")[-1], [k.split(".")[-1] for k in words], n=1, cutoff=0.4)

@@ -30,7 +30,7 @@ ALLOWED = {
     "backends": set(),
     "parameters": {"types", "validation"},
     "effects": {"compat", "types", "parameters", "validation", "jobs.import_file"},
-    "roads": {"types"},
+    "roads": {"types", "validation"},
     "delay_buffer": {"types"},
     "step": {"types", "parameters", "effects", "roads", "delay_buffer"},
     "multilane": {"types", "roads", "step"},

@@ -37,7 +37,7 @@ from idm_env.effects import (
 from idm_env.fitting.fit import refuse_nan
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, silent
-from idm_env.validation import nearest
+from idm_env.parameters import nearest
 
 
 def discover(

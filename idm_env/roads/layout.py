@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from idm_env.roads.adjacent import within
+from idm_env.validation import at_least, one_of, whole
 
 ENDLESS = 1e9
 """Where a lane ends that does not (m): finite, as all that vehicles see."""
@@ -65,17 +66,14 @@ class LaneLayout:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ends", tuple(self.ends))
-        if isinstance(self.count, bool) or not isinstance(self.count, int) or self.count < 1:
-            raise ValueError(f"Lanes: count = {self.count!r} must be a whole number of at least 1.")
+        whole("Lanes: count", self.count, 1)
         if self.length is not None and self.ring is not None:
-            raise ValueError(f"Lanes: length = {self.length:g} m and ring = {self.ring:g} m: a road is one of them.")
+            raise ValueError(f"Lanes: length = {self.length} m and ring = {self.ring} m: a road is one of them.")
         for name, size in (("length", self.length), ("ring", self.ring)):
-            if size is not None and not 0.0 < size < ENDLESS:
-                raise ValueError(f"Lanes: {name} = {size:g} m must lie between 0 and {ENDLESS:g} m.")
-        if not 0.0 <= self.duration < ENDLESS:
-            raise ValueError(f"Lanes: duration = {self.duration:g} s must be a number of at least 0.")
-        if self.handed not in ("left", "right"):
-            raise ValueError(f"Lanes: handed = {self.handed!r} must be 'left' or 'right'.")
+            if size is not None:
+                at_least(f"Lanes: {name}", size, 1.0, "m", ENDLESS)
+        at_least("Lanes: duration", self.duration, 0.0, "s", ENDLESS)
+        one_of("Lanes: handed", self.handed, ("left", "right"))
         if self.ring is not None and self.ends:
             raise ValueError("Lanes: a ring has no ends. Give a length, or leave the ends out.")
         self._check_ends()
@@ -88,8 +86,7 @@ class LaneLayout:
             if end.lane in seen:
                 raise ValueError(f"lane {end.lane} has two ends. Give one for each lane.")
             seen.add(end.lane)
-            if end.closed and end.end <= max(end.begin, 0.0):
-                begin = max(end.begin, 0.0)
+            if end.closed and end.end <= (begin := max(end.begin, 0.0)):
                 raise ValueError(f"lane {end.lane} ends at {end.end:g} m, and begins at {begin:g} m: end it later.")
             last = ENDLESS if self.length is None else self.length
             if not end.begin <= max(end.opens, end.begin) < end.closes <= end.end <= last:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from idm_env.roads.base import Road
 from idm_env.types import State
+from idm_env.validation import at_least
 
 
 @dataclass(frozen=True)
@@ -17,11 +18,15 @@ class Ring(Road):
     """Independent rings, one per batch row. Positions are unwrapped: they grow without end, lap after lap.
 
     ``circumference`` (m) is needed only where a state is made: gaps are state afterwards. A tensor of one per batch row
-    can be given there instead.
+    can be given there instead. ValueError for a circumference that is no number of at least 1 m.
     """
 
     circumference: float | None = None
     around: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.circumference is not None:
+            at_least("Ring: circumference", self.circumference, 1.0, "m", 1e9)
 
     def ahead(self, x: Tensor) -> Tensor:
         """Return the leader's x."""

@@ -422,5 +422,5 @@ def test_timed_changes_on_mirrored_roads_and_with_trips() -> None:
 
 def test_durations_that_cannot_be_are_one_line() -> None:
     """Below 0."""
-    with pytest.raises(ValueError, match="duration = -1 s must be a number of at least 0"):
+    with pytest.raises(ValueError, match="duration = -1 s must be at least 0"):
         Lanes(2, duration=-1.0)

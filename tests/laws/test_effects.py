@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -242,6 +243,25 @@ def test_every_step_shape_survives_parameters_per_vehicle() -> None:
     _, per_vehicle = simulator.rollout(start(simulator, full, batch=(2,)), {}, full, 10)
     for other in (per_row, per_vehicle):
         torch.testing.assert_close(scalar.position, other.position, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (lambda: Simulator(Ring, (IDM(),)), "road: ABCMeta is no road"),  # type: ignore[arg-type]
+        (lambda: Simulator(Lane(), IDM), "effects: type is no effect"),  # type: ignore[arg-type]
+        (lambda: Simulator(Lane(), (IDM(), "brakes")), "effects: str is no effect"),  # type: ignore[arg-type]
+        (lambda: Simulator(Lane(), (IDM(),), dt="0.1"), "dt = '0.1' must be a finite number"),  # type: ignore[arg-type]
+        (lambda: Ring("230"), "circumference = '230' must be a finite number"),  # type: ignore[arg-type]
+        (lambda: Ring(-1.0), "circumference = -1 m must be at least 1"),
+        (lambda: Lanes(2, length=[3]), "length = .3. must be a finite number"),  # type: ignore[arg-type]
+        (lambda: Lanes(2, ring=True), "ring = True must be a finite number"),
+        (lambda: Lanes(2.0), "count = 2.0 must be a whole number"),  # type: ignore[arg-type]
+    ],
+)
+def test_what_a_simulator_is_not_made_of_is_one_line(wrong: Callable[[], object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        wrong()
 
 
 def test_two_hooks_or_none_are_refused() -> None:
