@@ -47,7 +47,7 @@ LAYERS = [nn.Linear(6, 7), nn.Tanh(), nn.Linear(7, 37), nn.ReLU(), nn.Linear(37,
 def test_values_and_gradients_are_those_of_torch(policy, memory, dtype):
     torch.manual_seed(1)
     policy = policy().to(dtype)
-    driver = Driver(policy, 2, 6, 2, dtype, memory)
+    driver = Driver(policy, 6, 2, dtype, memory)
     weights = {n: x.detach().numpy() for n, x in driver.weights(policy).items()}
     close, shapes = 2e-5 if dtype == torch.float32 else 1e-12, {"seen": (6,), **({"hidden": memory} if memory else {})}
     for rows in (1, 33, 64, 100):
@@ -86,5 +86,6 @@ def test_a_tensor_whose_place_is_noted_lives_while_loops_are_recorded(monkeypatc
 
     monkeypatch.setattr(RowFunction, "_enter", watched)
     policy = nn.Sequential(nn.Linear(3, 7), nn.Tanh(), nn.Linear(7, 37), nn.ReLU(), nn.Linear(37, 2))
-    Driver(policy.to(torch.float64), 2, 3, 2, torch.float64)
+    driver = Driver(policy.to(torch.float64), 3, 2, torch.float64)
+    assert driver.forward and driver.backward
     assert len(noted) > 10
