@@ -28,7 +28,7 @@ demo: $(VENV)/.data
 # compile it unoptimised, which takes half the time. Each file on one worker, which compiles its programs once.
 FACES := $(addprefix tests/envs/test_,gym.py pettingzoo.py sb3.py render.py limits.py fitting_wrapper.py)
 LITTLE := tests/agents tests/tasks tests/envs/test_recording.py $(FACES) \
-  $(filter-out tests/test_docs.py,$(wildcard tests/test_*.py))
+  $(filter-out tests/test_docs.py tests/test_faults.py,$(wildcard tests/test_*.py))
 TEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST)
 test: test-much test-little
 

@@ -44,12 +44,17 @@ def methods(result: dict[str, Any]) -> None:
     show("Methods on these data", rows)
 
 
-def undecided(result: dict[str, Any], out: Path) -> None:
-    """Say why nothing can be told."""
+def _account(result: dict[str, Any]) -> str:
+    from idm_env.data import Repair
     from idm_env.reports.page import account
 
+    return account(Repair(**each) for each in result["data"]["repairs"])
+
+
+def undecided(result: dict[str, Any], out: Path) -> None:
+    """Say why nothing can be told."""
     console.print(Text.assemble("Verdict: ", ("cannot tell", "bold"), f". {result['sentence']}"), soft_wrap=True)
-    finished(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
+    finished(out, _account(result))
 
 
 def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
@@ -59,7 +64,6 @@ def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> Non
         return
     from idm_env.discovery.result import Ceilings, Weight
     from idm_env.discovery.words import ERRORS, ceilings, laws, weight
-    from idm_env.reports.page import account
     from idm_env.reports.undecided import FOUND
 
     console.print(Text.assemble("Verdict: ", (result["verdict"].replace("_", " "), "bold"), ". "), end="")
@@ -84,7 +88,7 @@ def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> Non
     console.print("; ".join(words), highlight=False)
     if (out / FOUND).is_file():
         console.print(f"{FOUND} is the shape as an effect, to be used and changed", highlight=False)
-    finished(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
+    finished(out, _account(result))
 
 
 def _error_row(

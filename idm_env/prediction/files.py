@@ -116,9 +116,7 @@ class _Job(NamedTuple):
 
 def _fingerprint(files: Sequence[Path], baselines: bool) -> str:
     """Return a digest of names, sizes and times of the files, and of the settings."""
-    stats = [
-        (path.name, path.stat().st_size, path.stat().st_mtime_ns) if path.exists() else path.name for path in files
-    ]
+    stats = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) if p.exists() else p.name for p in files]
     return storage.fingerprint(stats, baselines)
 
 
@@ -137,8 +135,7 @@ def _predict_file(job: _Job, progress: OnProgress) -> None:
         scene = MapScene(scenario)
         notes += [{"scenario": scenario.id, "note": note} for note in _notes(scenario)]
         for index in scenario.to_predict:
-            done = _agent(scene, index, job.methods, left_out)
-            if done is None:
+            if (done := _agent(scene, index, job.methods, left_out)) is None:
                 continue
             ours = done[OURS]
             tables.append(_rows(scenario, ours))

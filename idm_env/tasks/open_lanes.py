@@ -157,7 +157,9 @@ class OpenLanesTask(LanesTask):
         for lane, flow in flows.items():
             at_least(f"inflow of lane {lane}", flow, 1.0, "vehicles an hour")
         total = sum(flows.values())
-        round_trip, free = 3600.0 * self.vehicles / (total * self._busiest), (self.road.length or 0) / self.entry_speed
+        # Who enters slowly goes on faster.
+        free = (self.road.length or 0) / max(self.entry_speed, type(self).entry_speed)
+        round_trip = 3600.0 * self.vehicles / (total * self._busiest)
         for lane, flow in flows.items():
             if self.vehicles * flow < total:
                 raise ValueError(

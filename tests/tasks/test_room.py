@@ -25,7 +25,7 @@ def bus(length: float) -> dict[str, Any]:
 
 
 DENSE: list[dict[str, Any]] = [
-    {"inflow": 2000.0, **bus(18.0)}, {"inflow": 4400.0, **bus(18.75)}, {"inflow": 6000.0}, {"inflow": 9000.0},
+    {"inflow": 2000.0, **bus(18.0)}, {"inflow": 4400.0, **bus(18.75)}, {"inflow": 6000.0}, {"inflow": 8000.0},
     {"vehicle_length": 40.0}, {"entry_speed": 3.0}, {"entry_speed": 40.0, "inflow": 5000.0},
     {"parameters": {"idm.min_gap": 8.0, "idm.time_gap": 3.0}}, {"randomise": {"idm.time_gap": [0.5, 3.0]}},
     {"vehicles": 8}, {"closures": [{"lane": 0, "begin": 150.0, "end": 200.0}]},
