@@ -215,11 +215,8 @@ def coordinates(columns: list[str]) -> dict[str, str]:
 
 def _check_plane(frame: pl.DataFrame, taken: Mapping[str, str], source: str) -> None:
     """Raise DataError if the position is one coordinate of two, and vehicles move along the other one as well."""
-    plane, along, vehicle = (
-        coordinates(frame.columns),
-        taken.get("position_m", ""),
-        taken.get("vehicle_id", "vehicle_id"),
-    )
+    plane = coordinates(frame.columns)
+    along, vehicle = taken.get("position_m", ""), taken.get("vehicle_id", "vehicle_id")
     if along not in plane.values() or vehicle not in frame.columns:
         return
     across = next(column for column in plane.values() if column != along)
