@@ -380,8 +380,8 @@ def _platoon(added: Any) -> Any:
 
 def _rolled(added: Any) -> Any:
     from idm_env import IDM, Brakes, Lane, Replay, Simulator
+    from idm_env.compiled.kernels import dispatch
     from idm_env.effects import CarFollowing
-    from idm_env.kernels import dispatch
     from idm_env.types import Record
 
     vehicles = 4

@@ -76,7 +76,7 @@ def _register() -> None:
 
 
 _register()
-backends.enter("idm_env.kernels.dispatch:rollout")
+backends.enter("idm_env.compiled.kernels.dispatch:rollout")
 
 
 def __getattr__(name: str) -> Any:

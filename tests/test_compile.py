@@ -5,8 +5,8 @@ import warnings
 import pytest
 import torch
 
+from idm_env.compiled.kernels import dispatch
 from idm_env.effects import ALL, BASES, IDM, Brakes, Curve, DriverCurve, make
-from idm_env.kernels import dispatch
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
 from idm_env.types import Adjacent, Command, Imagined, Record

@@ -316,7 +316,7 @@ READERS = {
     "pickle.loads": {"jobs/executor.py", "compat.py"},
     "import_module": {"data/__init__.py", "__init__.py", "backends.py", "effects/registry.py", "cli/commands.py"},
     "spec_from_file_location": {"jobs/import_file.py"},
-    "exec": {"kernels/compiler.py", "kernels/emitted.py"},
+    "exec": {"compiled/kernels/compiler.py", "compiled/kernels/emitted.py"},
 }
 """What may run or build whatever a file says, and where: executors pickle for their own workers, caches are sealed."""
 NEVER = re.compile(

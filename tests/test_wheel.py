@@ -194,7 +194,9 @@ def test_without_extras_every_module_is_imported_or_names_its_extra(
             name, why,
         )  # fmt: skip
     assert {name.split(".")[1] for name, why in told.items() if why != "imported"} == OF_EXTRAS
-    assert told["idm_env.envs.sb3"].endswith("[sb3]'") and told["idm_env.kernels.printed"].endswith("[kernels]'")
+    assert told["idm_env.envs.sb3"].endswith("[sb3]'") and told["idm_env.compiled.kernels.printed"].endswith(
+        "[kernels]'"
+    )
 
 
 IMPORTING = """
@@ -206,7 +208,7 @@ for name in open("modules.txt").read().split():
     except ImportError as error:
         print(name, error, sep="\\t")
 """
-OF_EXTRAS = {"cli", "data", "discovery", "drift", "envs", "fitting", "jobs", "kernels", "prediction", "trajectories"}
+OF_EXTRAS = {"cli", "compiled", "data", "discovery", "drift", "envs", "fitting", "jobs", "prediction", "trajectories"}
 """Parts of the package of which some module needs an extra (of ``envs``: Stable-Baselines3's face)."""
 
 STEPPING = """

@@ -15,10 +15,10 @@ import torch
 
 from benchmarks.bench import fits, gpu, gradients, memory, peers, tables, traffic
 from benchmarks.bench.measure import Case, machine, measure
-from idm_env import kernels
+from idm_env.compiled import kernels
+from idm_env.compiled.kernels import dispatch
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, silent
-from idm_env.kernels import dispatch
 
 OUTPUT = ("performance.json", "performance.png", "report.html")
 SIZES = (2_000, 20_000, 200_000, 2_000_000)

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.bench.measure import Case, measure
+from idm_env.compiled.kernels import dispatch
 from idm_env.effects import ALL, CANDIDATES, IDM, Brakes, Replay, make
-from idm_env.kernels import dispatch
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
 from idm_env.types import Record
@@ -26,7 +26,7 @@ class Followers:
     """Drivers behind leaders that brake and drive off again, and the rollouts that a fit makes of them."""
 
     def __init__(self, drivers: int, steps: int, *effects: str) -> None:
-        from idm_env.kernels import drivers as kernels
+        from idm_env.compiled.kernels import drivers as kernels
 
         generator = torch.Generator().manual_seed(0)
 

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.bench.measure import Case
+from idm_env.compiled.kernels import dispatch
 from idm_env.effects import IDM, Brakes
-from idm_env.kernels import dispatch
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 from idm_env.types import State
@@ -88,8 +88,8 @@ class Traffic:
 
         One step per call cannot be faster: three states and six parameters come from memory, four states go there.
         """
-        from idm_env.kernels.tiles import exact
-        from idm_env.kernels.workspace import take
+        from idm_env.compiled.kernels.tiles import exact
+        from idm_env.compiled.kernels.workspace import take
 
         read = [getattr(self.state, n).reshape(-1).numpy() for n in ("gap", "speed", "position")]
         read += [leaf.detach().reshape(-1).numpy() for leaf in self.leaves]

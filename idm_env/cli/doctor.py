@@ -82,7 +82,7 @@ def _compared() -> Finding:
     import torch
 
     from idm_env import IDM, Brakes, Lane, Simulator
-    from idm_env.kernels import dispatch
+    from idm_env.compiled.kernels import dispatch
 
     simulator = Simulator(Lane(), (IDM(), Brakes()), dt=0.1)
     params = simulator.defaults(dtype=torch.float64)
@@ -125,7 +125,7 @@ def _gpu() -> Finding:
 
 
 def _cache(what: str, variable: str) -> Finding:
-    from idm_env.scalar import library
+    from idm_env.compiled.scalar import library
 
     wished, used = os.environ.get(variable), library.folder(variable)
     cure = f"Set {variable} to a folder to which you may write, and nobody else."

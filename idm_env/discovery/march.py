@@ -22,17 +22,17 @@ from typing import Any
 import numpy as np
 
 from idm_env import delay_buffer, effects as known
-from idm_env.discovery import march_loops
+from idm_env.compiled.records import march_loops
+from idm_env.compiled.scalar import library
+from idm_env.compiled.scalar.graph import Leaf, TimeStep
+from idm_env.compiled.scalar.record import Form, Recording, Untraceable, record, slot_name
+from idm_env.compiled.scalar.regions import Flagged, Regions
+from idm_env.compiled.scalar.straight import Straight
 from idm_env.discovery.slots import SETS, TARGETS, Push, Slot as Changed
 from idm_env.effects import IDM, Brakes, CarFollowing, Effect
 from idm_env.effects.free import FEATURES, PER
 from idm_env.parameters import Parameter
 from idm_env.roads import Lane
-from idm_env.scalar import library
-from idm_env.scalar.graph import Leaf, TimeStep
-from idm_env.scalar.record import Form, Recording, Untraceable, record, slot_name
-from idm_env.scalar.regions import Flagged, Regions
-from idm_env.scalar.straight import Straight
 from idm_env.step import CarFollowingStep
 
 ROOM = march_loops.ROOM

@@ -21,7 +21,7 @@ import torch
 from scipy.optimize import minimize
 from scipy.stats import t as student
 
-from idm_env.drift import filter_loops as loops
+from idm_env.compiled.records import filter_loops as loops
 from idm_env.drift.linear import MeasuredDrivers, Path
 from idm_env.fitting.batch import Batch
 from idm_env.jobs.progress import OnProgress, silent

@@ -20,6 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels import dispatch
+from idm_env.compiled.scalar.record import Unordered, Untraceable
 from idm_env.envs.beginnings import Beginnings
 from idm_env.envs.counters import Counters
 from idm_env.envs.given import checked
@@ -27,8 +29,6 @@ from idm_env.envs.moves import Moves
 from idm_env.envs.recording import Recorder
 from idm_env.envs.settings import INFO, Settings
 from idm_env.jobs.storage import lacks_memory
-from idm_env.kernels import dispatch
-from idm_env.scalar.record import Unordered, Untraceable
 from idm_env.tasks import Draw, EnvState
 from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.types import Params, State, mapped, worthwhile

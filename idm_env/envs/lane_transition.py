@@ -16,20 +16,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels import lane_change_loops
+from idm_env.compiled.kernels.lane_changes import decision, rows_of
+from idm_env.compiled.kernels.lanes import static_of
+from idm_env.compiled.kernels.operands import operand
+from idm_env.compiled.kernels.rows import RowFunction, adjoint, storage
+from idm_env.compiled.scalar.record import Form, Unordered, Untraceable, slot_name
 from idm_env.delay_buffer import PAST
 from idm_env.envs.moves import Moves
 from idm_env.envs.transition import CompiledTransition, Tables, WholeStep
 from idm_env.envs.worlds import WHOLE, Array, Group, Layout, Moment, Room, RowTable, address, named, world_of
-from idm_env.kernels import lane_change_loops
-from idm_env.kernels.lane_changes import decision, rows_of
-from idm_env.kernels.lanes import static_of
-from idm_env.kernels.operands import operand
-from idm_env.kernels.rows import RowFunction, adjoint, storage
 from idm_env.multilane.demand import turned
 from idm_env.multilane.incentives import seen_merging
 from idm_env.roads import Lanes
 from idm_env.roads.merging import on_lanes
-from idm_env.scalar.record import Form, Unordered, Untraceable, slot_name
 from idm_env.tasks import EnvState
 from idm_env.types import LINKS, Params
 

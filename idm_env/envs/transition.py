@@ -17,6 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels import threads as pool
+from idm_env.compiled.kernels.past_in_place import Stepper
+from idm_env.compiled.kernels.reads import Reads
+from idm_env.compiled.kernels.rows import RowFunction, adjoint, storage
+from idm_env.compiled.kernels.sameness import digest
+from idm_env.compiled.scalar.record import Unordered, Untraceable
 from idm_env.delay_buffer import PAST
 from idm_env.envs.moves import Moves
 from idm_env.envs.past import ROOM
@@ -33,12 +39,6 @@ from idm_env.envs.worlds import (
     named,
     world_of,
 )  # fmt: skip
-from idm_env.kernels import threads as pool
-from idm_env.kernels.past_in_place import Stepper
-from idm_env.kernels.reads import Reads
-from idm_env.kernels.rows import RowFunction, adjoint, storage
-from idm_env.kernels.sameness import digest
-from idm_env.scalar.record import Unordered, Untraceable
 from idm_env.tasks import EnvState
 from idm_env.types import Params, State
 

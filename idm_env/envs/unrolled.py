@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels import dispatch
+from idm_env.compiled.scalar.record import Untraceable
 from idm_env.envs.batch import Batch, in_memory
 from idm_env.envs.policy_call import NO_NUMBERS, policy_outputs
-from idm_env.kernels import dispatch
-from idm_env.scalar.record import Untraceable
 
 
 class Unrolled(NamedTuple):

@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels.reads import Reads
+from idm_env.compiled.scalar.record import Unordered, Untraceable
 from idm_env.delay_buffer import PAST
 from idm_env.envs.lane_transition import LaneTransition
 from idm_env.envs.moves import Moves
 from idm_env.envs.past import Past
 from idm_env.envs.transition import CompiledTransition, Tables
 from idm_env.envs.worlds import WHOLE, Array, Layout, Moment, named, world_of
-from idm_env.kernels.reads import Reads
-from idm_env.scalar.record import Unordered, Untraceable
 from idm_env.tasks import EnvState
 from idm_env.types import Params, mapped
 

@@ -15,16 +15,16 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from idm_env.compiled.kernels import threads as pool
+from idm_env.compiled.kernels.policy_rows import PolicyRows
+from idm_env.compiled.kernels.rows import RowFunction, adjoint
+from idm_env.compiled.kernels.sameness import digest
+from idm_env.compiled.kernels.window_loop import AHEAD, BLOCK, window, window_back
+from idm_env.compiled.scalar.record import Untraceable
 from idm_env.envs.policy_call import NO_NUMBERS, policy_outputs
 from idm_env.envs.transition import CompiledTransition, Tables
 from idm_env.envs.values import token_like
 from idm_env.envs.worlds import Array, Moment, address
-from idm_env.kernels import threads as pool
-from idm_env.kernels.policy_rows import PolicyRows
-from idm_env.kernels.rows import RowFunction, adjoint
-from idm_env.kernels.sameness import digest
-from idm_env.kernels.window_loop import AHEAD, BLOCK, window, window_back
-from idm_env.scalar.record import Untraceable
 
 if TYPE_CHECKING:
     from idm_env.envs.batch import Batch

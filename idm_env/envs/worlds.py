@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
+from idm_env.compiled.kernels.rows import RowFunction
 from idm_env.delay_buffer import PAST
-from idm_env.kernels.rows import RowFunction
 from idm_env.tasks import EnvState
 from idm_env.types import LINKS, State, Trips
 

@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels import dispatch
 from idm_env.data import DataError, Episode
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.solver import Box, Normal
-from idm_env.kernels import dispatch
 from idm_env.parameters import Parameter, catalogue, nearest, replaced
 from idm_env.simulator import Simulator
 from idm_env.types import Inputs, State
 from idm_env.validation import one_of
 
 if TYPE_CHECKING:
-    from idm_env.kernels.drivers import BehindRecord
+    from idm_env.compiled.kernels.drivers import BehindRecord
 
 Objective = Literal["spacing", "speed", "both"]
 Loss = Literal["mse", "rmse"]
@@ -196,7 +196,7 @@ class Problem:
     @cached_property
     def _prepared(self) -> BehindRecord | str:
         """The compiled rollout of these drivers, or why there is none."""
-        from idm_env.kernels import drivers
+        from idm_env.compiled.kernels import drivers
 
         batch, (vehicles, driver) = self.batch, self.batch.columns(self.simulator)
         records = {"position": batch.position, "speed": batch.all_speed, "accel": batch.accel, "present": batch.present}

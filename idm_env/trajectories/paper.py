@@ -28,7 +28,7 @@ from idm_env.trajectories.tracks import TrackPiece
 from idm_env.types import Imagined, Neighbour, Scene
 
 if TYPE_CHECKING:
-    from idm_env.kernels.descent import Bounds, DescentResult
+    from idm_env.compiled.kernels.descent import Bounds, DescentResult
 
 NAMES = ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed")
 START = np.array([10.0, 2.0, 1.0, 5.0, 50.0])
@@ -161,7 +161,7 @@ def _descended(
     steps: Sequence[np.ndarray], targets: Sequence[np.ndarray], bounds: Bounds, iterations: int,
 ) -> DescentResult:  # fmt: skip
     """Fit rows of ``values`` [N, 5] and of the input ``ahead`` (steps, N, 1) to distances at ``steps`` [N]."""
-    from idm_env.kernels.descent import Observed, descend
+    from idm_env.compiled.kernels.descent import Observed, descend
 
     simulator = Simulator(Lane(), (IDM(sharpness=1.0), leader, Brakes(sharpness=1.0)), dt, "euler")
     params: Any = simulator.defaults(dtype=torch.float64)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from idm_env.trajectories import smoother_loops as loops
+from idm_env.compiled.records import smoother_loops as loops
 
 N = loops.N
 TIGHT = 1e-8

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("numba")
 
-from idm_env.drift import filter_loops as loops
+from idm_env.compiled.records import filter_loops as loops
 
 SAMPLES, ROWS, K = 7, 2, 2
 D = 2 + K

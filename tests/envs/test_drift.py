@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401 (registers the environments)
+from idm_env.compiled.kernels import dispatch
 from idm_env.effects import IDM, AccelNoise, Brakes, PerceptionNoise, Wander
-from idm_env.kernels import dispatch
 from idm_env.model_file import Model, save_model
 
 UNSTEADY = (IDM(), Wander(), PerceptionNoise(signal="closing_speed"), AccelNoise(), Brakes())

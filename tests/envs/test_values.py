@@ -9,11 +9,11 @@ import torch
 
 import idm_env  # noqa: F401
 from idm_env import backends
+from idm_env.compiled.kernels.rows import RowFunction
+from idm_env.compiled.scalar.record import Untraceable
 from idm_env.envs.batch import Batch
 from idm_env.envs.settings import settings
 from idm_env.envs.values import Values
-from idm_env.kernels.rows import RowFunction
-from idm_env.scalar.record import Untraceable
 from idm_env.simulator import Simulator
 from tests.envs.test_step_gradients import CASES as LANES, DECLARED, WEIGHTS
 

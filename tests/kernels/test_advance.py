@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from idm_env.compiled.kernels import dispatch
 from idm_env.effects import IDM, Brakes, make
-from idm_env.kernels import dispatch
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
 from idm_env.tasks import Draw, make_task
@@ -155,7 +155,7 @@ def test_a_call_leaves_the_states_of_earlier_calls_alone():
 def test_a_step_that_is_switched_off_is_not_compiled(monkeypatch):
     simulator, state, params = plain()
     simulator.advance(state, {}, params)
-    from idm_env.kernels import lanes
+    from idm_env.compiled.kernels import lanes
 
     monkeypatch.setattr(lanes, "planned", lambda *call: pytest.fail("a compiled step ran"))
     with dispatch.off():

@@ -14,12 +14,12 @@ from idm_env.data import synthetic
 
 PACKAGE = Path(__file__).parents[2] / "idm_env"
 PROBE = """
-from idm_env.kernels import caller
+from idm_env.compiled.kernels import caller
 print(caller.twice(3))
 """
 CALLER = """
-from idm_env.kernels.callee import value
-from idm_env.kernels.tiles import exact
+from idm_env.compiled.kernels.callee import value
+from idm_env.compiled.kernels.tiles import exact
 
 
 @exact
@@ -27,7 +27,7 @@ def twice(x):
     return 2 * value(x)
 """
 CALLEE = """
-from idm_env.kernels.compiler import apart, compiler
+from idm_env.compiled.kernels.compiler import apart, compiler
 
 
 @{how}
@@ -41,8 +41,8 @@ def test_a_change_in_a_function_that_a_loop_calls_is_noticed(tmp_path, how):
     """Numba itself looks only at the file of the outermost function. Code optimised less than usual is other code."""
     copy = tmp_path / "idm_env"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    (copy / "kernels" / "caller.py").write_text(CALLER)
-    callee = copy / "kernels" / "callee.py"
+    (copy / "compiled" / "kernels" / "caller.py").write_text(CALLER)
+    callee = copy / "compiled" / "kernels" / "callee.py"
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "IDM_ENV_CACHE": str(tmp_path / "cache")}
     environment.pop("NUMBA_CACHE_DIR", None)
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from idm_env.compiled.kernels import dispatch
 from idm_env.effects import IDM, Brakes, Delay
-from idm_env.kernels import dispatch
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 
-descent = pytest.importorskip("idm_env.kernels.descent", reason="numba is not installed")
+descent = pytest.importorskip("idm_env.compiled.kernels.descent", reason="numba is not installed")
 STEPS, COUNT = 40, 3
 
 

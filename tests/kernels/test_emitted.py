@@ -7,16 +7,16 @@ import pytest
 
 pytest.importorskip("numba")
 
-from idm_env.scalar import library
+from idm_env.compiled.scalar import library
 
 TEXT = '''
 import numpy as np
 from numba import carray, types
 
-from idm_env.kernels.compiler import phase
-from idm_env.kernels.emitted import emitted
-from idm_env.kernels.functions import exp_{kind} as exp
-from idm_env.kernels.memory import located
+from idm_env.compiled.kernels.compiler import phase
+from idm_env.compiled.kernels.emitted import emitted
+from idm_env.compiled.kernels.functions import exp_{kind} as exp
+from idm_env.compiled.kernels.memory import located
 
 F, U = np.{kind}, np.uint64
 SIZE = (1 << 40,)

@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels import dispatch, drivers
 from idm_env.effects import IDM, AccelNoise, Brakes, Effect, Grade, Replay, make
 from idm_env.effects.base import CarFollowing, P
-from idm_env.kernels import dispatch, drivers
 from idm_env.parameters import Parameter
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator

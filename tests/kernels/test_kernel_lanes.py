@@ -4,8 +4,8 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
+from idm_env.compiled.kernels import dispatch, lane_loops, lanes, tiles
 from idm_env.effects import IDM, Brakes, Control, Noise, Replay, make
-from idm_env.kernels import dispatch, lane_loops, lanes, tiles
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
 from idm_env.types import Command, Record

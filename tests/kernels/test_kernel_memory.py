@@ -5,8 +5,8 @@ import tracemalloc
 import pytest
 import torch
 
+from idm_env.compiled.kernels import dispatch, lanes
 from idm_env.effects import IDM, Brakes
-from idm_env.kernels import dispatch, lanes
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels import dispatch
 from idm_env.effects import IDM, Brakes, Effect, LaneCommand, MandatoryChange, Mobil, make
-from idm_env.kernels import dispatch
 from idm_env.multilane import demand
 from idm_env.roads import Lanes, lane_drop, off_ramp, on_ramp
 from idm_env.simulator import Simulator, Trajectory

@@ -10,8 +10,8 @@ from torch import nn
 
 pytest.importorskip("numba")
 
+from idm_env.compiled.kernels.rows import RowFunction
 from idm_env.envs.window import Driver
-from idm_env.kernels.rows import RowFunction
 
 
 def called(loops, rows, arrays):

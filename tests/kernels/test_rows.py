@@ -11,9 +11,9 @@ import torch
 pytest.importorskip("numba")
 
 from idm_env import IDM, Lanes, Simulator
+from idm_env.compiled.kernels.rows import RowFunction, adjoint
 from idm_env.effects import Mobil, make
 from idm_env.envs.worlds import examples_of, named, world_of
-from idm_env.kernels.rows import RowFunction, adjoint
 from idm_env.multilane.demand import trips, waiting
 from idm_env.roads.layout import lane_drop
 from idm_env.tasks import EnvState

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("numba")
 import numba
 
-from idm_env.kernels import staged
+from idm_env.compiled.kernels import staged
 
 
 @staged.staged(4)

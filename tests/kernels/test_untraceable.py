@@ -10,8 +10,8 @@ from typing import ClassVar
 import pytest
 import torch
 
+from idm_env.compiled.kernels import dispatch
 from idm_env.effects import IDM, Brakes, Effect
-from idm_env.kernels import dispatch
 from idm_env.parameters import Parameter
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
@@ -151,7 +151,7 @@ if {blocked}:
 warnings.simplefilter("error")
 import gymnasium, torch, idm_env
 from idm_env.effects import IDM, Brakes, make
-from idm_env.kernels import dispatch
+from idm_env.compiled.kernels import dispatch
 from idm_env.roads import Lane, Ring
 
 for road in (Lane(), Ring(120.0)):

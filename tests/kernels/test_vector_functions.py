@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-functions = pytest.importorskip("idm_env.kernels.functions", reason="numba is not installed")
+functions = pytest.importorskip("idm_env.compiled.kernels.functions", reason="numba is not installed")
 numba = pytest.importorskip("numba")
 
 

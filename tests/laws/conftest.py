@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from idm_env.kernels import dispatch
+from idm_env.compiled.kernels import dispatch
 
 
 @pytest.fixture(autouse=True)

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from benchmarks import lanes
+from idm_env.compiled.kernels import dispatch
 from idm_env.effects import IDM, Brakes, make
 from idm_env.jobs import progress
-from idm_env.kernels import dispatch
 from idm_env.roads import Lane, Lanes, Ring, lane_drop, off_ramp, on_ramp
 from idm_env.simulator import Simulator
 from idm_env.types import Record, State

@@ -15,6 +15,8 @@ import torch
 
 import idm_env  # noqa: F401  (registers the environments)
 from idm_env import backends
+from idm_env.compiled.scalar.graph import Graph
+from idm_env.compiled.scalar.straight import constant_text
 from idm_env.data import episodes, synthetic
 from idm_env.discovery.discover import discover
 from idm_env.effects import IDM, Brakes, CarFollowing, Effect, Mobil, Replay
@@ -25,8 +27,6 @@ from idm_env.fitting.job import problem_of
 from idm_env.model_file import Model
 from idm_env.parameters import Parameter
 from idm_env.roads import Lane, Lanes
-from idm_env.scalar.graph import Graph
-from idm_env.scalar.straight import constant_text
 from idm_env.simulator import Simulator
 from idm_env.types import Wish
 

@@ -13,9 +13,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels import dispatch
 from idm_env.effects import ALL, BASES, IDM, Brakes, CarFollowing, Effect, make
 from idm_env.effects.base import P
-from idm_env.kernels import dispatch
 from idm_env.parameters import Parameter
 from idm_env.roads import Lane, Ring, Road
 from idm_env.simulator import Simulator

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels import dispatch
 from idm_env.effects import (
     IDM,
     Brakes,
@@ -20,7 +21,6 @@ from idm_env.effects import (
     Signal,
     SpeedLimit,
 )
-from idm_env.kernels import dispatch
 from idm_env.multilane import demand
 from idm_env.roads import Lanes, off_ramp
 from idm_env.simulator import Simulator

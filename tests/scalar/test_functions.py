@@ -12,9 +12,9 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
-from idm_env.scalar.derive import RULES, adjoint
-from idm_env.scalar.graph import BOOLEAN, Graph, Node, ordered
-from idm_env.scalar.scalar import FUNCTIONS, Scalar, Untraceable, value_of
+from idm_env.compiled.scalar.derive import RULES, adjoint
+from idm_env.compiled.scalar.graph import BOOLEAN, Graph, Node, ordered
+from idm_env.compiled.scalar.scalar import FUNCTIONS, Scalar, Untraceable, value_of
 
 EVALUATED: dict[str, Callable[..., Any]] = {
     "add": lambda a, b: a + b,
@@ -226,7 +226,7 @@ def test_every_function_is_tested() -> None:
 
     table = Asked(FUNCTIONS)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("idm_env.scalar.scalar.FUNCTIONS", table)
+        patch.setattr("idm_env.compiled.scalar.scalar.FUNCTIONS", table)
         for function in ONE.values():
             recorded(function, (0.7,))
         for function in TWO.values():

@@ -9,12 +9,12 @@ import pytest
 
 pytest.importorskip("numba")
 
-from idm_env.scalar import library
+from idm_env.compiled.scalar import library
 
 TEXT = """
 from numba import carray, types
 
-from idm_env.kernels.compiler import compiler, phase
+from idm_env.compiled.kernels.compiler import compiler, phase
 
 
 @compiler()
@@ -167,14 +167,14 @@ def test_where_no_folder_serves_nothing_is_kept_and_nothing_left(tmp_path, cache
 
 
 def test_all_that_is_compiled_is_kept_in_one_way():
-    """Loops of kernels, trajectories and drift alike: none has a cache of numba's own."""
+    """Loops of kernels and of records alike: none has a cache of numba's own."""
     import importlib
 
     import numba
 
     from idm_env import compat
 
-    package = Path(library.__file__).parents[1]
+    package = Path(library.__file__).parents[2]
     found = set()
     for path in sorted(package.rglob("*.py")):
         if "kernels.compiler" not in path.read_text() and "compiled" not in path.read_text():
@@ -183,5 +183,5 @@ def test_all_that_is_compiled_is_kept_in_one_way():
         for each in vars(importlib.import_module(name)).values():
             if isinstance(each, numba.core.registry.CPUDispatcher):
                 assert isinstance(each._cache, compat._KeptCode), f"{name}.{each.__name__}"
-                found.add(each.__module__.split(".")[1])
-    assert {"kernels", "trajectories", "drift"} <= found
+                found.add(each.__module__.split(".")[2])
+    assert {"kernels", "records"} <= found

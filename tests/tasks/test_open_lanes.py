@@ -10,8 +10,8 @@ import torch
 import idm_env  # noqa: F401
 from benchmarks import lanes
 from idm_env import backends
+from idm_env.compiled.kernels import dispatch
 from idm_env.envs.pettingzoo import parallel_env
-from idm_env.kernels import dispatch
 from idm_env.multilane import demand
 from idm_env.tasks import BottleneckTask, Draw, MergeTask, make_task
 

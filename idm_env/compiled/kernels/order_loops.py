@@ -1,0 +1,133 @@
+"""Compiled order of several lanes: vehicles of each lane front first, and their layout as one row for a few steps.
+
+Rows of ``n`` slots lie one behind the other. ``order`` holds slots, lane 0 first, absent vehicles last; lane k has the
+ranks from ``begin[k]`` to ``begin[k + 1]``. On a ring a lane begins with whoever is furthest on his lap.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+from __future__ import annotations
+
+import numpy as np
+
+from idm_env.compiled.kernels.compiler import apart
+from idm_env.compiled.kernels.memory import copy
+from idm_env.compiled.kernels.tiles import exact
+
+
+@apart
+def walk(leader, follower, lane, position, present, coming, n, count, ring, base, order, begin, place):
+    """Put one row in order by its links, and places (m, within one lap) by rank; False if places do not fall.
+
+    ``coming`` says that ``present`` tells who is there.
+    """
+    heads, furthest, on_road = np.empty(count, np.int64), np.empty(count), 0
+    for k in range(count):
+        heads[k], furthest[k] = -1, -1.0
+    for i in range(n):
+        if coming and present[base + i] <= 0:
+            continue
+        on_road += 1
+        k = lane[base + i]
+        if ring > 0:
+            x = np.float64(position[base + i])
+            x -= np.floor(x / ring) * ring
+            if heads[k] < 0 or x > furthest[k]:
+                heads[k], furthest[k] = i, x
+        elif leader[base + i] == i or (coming and present[base + leader[base + i]] <= 0):
+            if heads[k] >= 0:
+                return False
+            heads[k] = i
+    rank = 0
+    for k in range(count):
+        begin[k] = rank
+        i = heads[k]
+        if i < 0:
+            continue
+        while rank < on_road:
+            x = np.float64(position[base + i])
+            if ring > 0:
+                x -= np.floor(x / ring) * ring
+            if rank > begin[k] and x > place[rank - 1]:
+                return False
+            order[rank], place[rank] = i, x
+            rank += 1
+            following = follower[base + i]
+            if following == i or following == heads[k]:
+                break
+            i = following
+    begin[count] = rank
+    if rank < on_road:
+        return False
+    if coming:
+        for i in range(n):
+            if present[base + i] <= 0:
+                order[rank] = i
+                rank += 1
+    return rank == n
+
+
+@apart
+def lay(order, begin, n, count, halo, wide, base, to, slots, own, led, leads):
+    """Lay one row of ``wide`` places out, from place ``to`` on: lanes behind one another, with copies at both ends.
+
+    Who is absent is alone, and so are places to spare, which are copies of slot 0.
+    """
+    p = to
+    for k in range(count):
+        first, size = begin[k], begin[k + 1] - begin[k]
+        if size == 0:
+            continue
+        for rank in range(-halo, size + halo):
+            slots[p] = order[first + rank % size] if halo else order[first + rank]
+            led[p] = rank > -halo
+            leads[p] = rank < size + halo - 1
+            if 0 <= rank < size:
+                own[base + order[first + rank]] = p - to
+            p += 1
+    for r in range(begin[count], n):
+        slots[p], led[p], leads[p], own[base + order[r]] = order[r], 0, 0, p - to
+        p += 1
+    while p < to + wide:
+        slots[p], led[p], leads[p] = 0, 0, 0
+        p += 1
+
+
+@apart
+def sort(key, order, spare, n):
+    """Put numbers in order of their keys, equal ones as they are; numpy's sort compiles ten times as long."""
+    for i in range(n):
+        order[i] = i
+    run = 1
+    while run < n:
+        for low in range(0, n, 2 * run):
+            i, middle, end = low, min(low + run, n), min(low + 2 * run, n)
+            j = middle
+            for to in range(low, end):
+                if i < middle and (j >= end or key[order[i]] <= key[order[j]]):
+                    spare[to], i = order[i], i + 1
+                else:
+                    spare[to], j = order[j], j + 1
+        copy(order, 0, spare, 0, n)
+        run *= 2
+
+
+@exact
+def laid_by(order, begin, rows, n, count, halo, wide, slots, own, led, leads):
+    """Lay all rows out by an order that is known: ``order`` (rows · n) and ``begin`` (rows · (count + 1))."""
+    for row in range(rows):
+        first, lanes = row * n, row * (count + 1)
+        lay(
+            order[first : first + n], begin[lanes : lanes + count + 1], n, count, halo, wide, first, row * wide, slots,
+            own, led, leads,
+        )  # fmt: skip
+
+
+@exact
+def laid(leader, follower, lane, position, present, coming, which, n, count, ring, halo, wide, slots, own, led, leads):
+    """Lay some rows out by their links; False where links are not the order of positions."""
+    order, begin, place = np.empty(n, np.int64), np.empty(count + 1, np.int64), np.empty(n)
+    for row in which:
+        if not walk(leader, follower, lane, position, present, coming, n, count, ring, row * n, order, begin, place):
+            return False
+        lay(order, begin, n, count, halo, wide, row * n, row * wide, slots, own, led, leads)
+    return True
