@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import references
 from idm_env.effects.base import Effect, P
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.types import Command, Driver, Motion, Record, Scene
 
 
@@ -23,7 +23,7 @@ class Control(Effect):
     """
 
     kind: ClassVar[str] = "control"
-    sources: ClassVar[tuple[str, ...]] = (references.JOHANNINK_2019,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["johannink_2019"],)
     takes: ClassVar[type | None] = Command
     adds: ClassVar[bool] = False
     rank: ClassVar[int] = 35

@@ -8,9 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import references
 from idm_env.effects.base import Effect, P, Sought
 from idm_env.effects.places import along, smooth_step, window
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
 
@@ -20,7 +20,7 @@ class SpeedDependentGap(Effect):
     """``s* += s1 √(v/v0)`` (Treiber, Hennecke, Helbing 2000), with √ continued linearly below v/v0 = 10⁻³."""
 
     kind: ClassVar[str] = "speed_dependent_gap"
-    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2000,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2000"],)
     rank: ClassVar[int] = 4
     title: ClassVar[str] = "speed-dependent gap"
     equation: ClassVar[str] = "s* += s1 √(v/v0)"
@@ -51,7 +51,7 @@ class LongMemory(Effect):
     """
 
     kind: ClassVar[str] = "memory"
-    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2003,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2003"],)
     title: ClassVar[str] = "memory of congestion"
     equation: ClassVar[str] = "T (1 + β (1 − λ)), τ dλ/dt = v/v0 − λ"
     wording: ClassVar[tuple[str, str]] = (

@@ -68,7 +68,7 @@ class Effect:
     ==============  ====================================================================================================
     ``title``       its plain name
     ``equation``    what it adds to IDM, in one line
-    ``sources``     the publications it is taken from, in full (``effects/references.py``); none for common knowledge
+    ``sources``     the publications it is taken from, in full (``effects/references.json``); none for common knowledge
     ``wording``     what drivers do then, in a clause: with the strength below its null, and above; ``{law}`` is the
                     law that the effect completes
     ``looks_like``  what it is most easily confused with: candidates, or parameters and curves in plain words

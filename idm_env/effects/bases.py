@@ -13,9 +13,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import references
 from idm_env.effects.base import CarFollowing, P
 from idm_env.effects.idm import IDM, OfFiveParameters, interaction
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
 
@@ -34,7 +34,7 @@ class IDMPlus(OfFiveParameters):
     """
 
     kind: ClassVar[str] = "idm_plus"
-    sources: ClassVar[tuple[str, ...]] = (references.SCHAKEL_2010,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["schakel_2010"],)
     adds: ClassVar[bool] = False
     title: ClassVar[str] = "IDM+"
     equation: ClassVar[str] = "a min(1 − (v/v0)⁴, 1 − (s*/s)²)"
@@ -60,7 +60,7 @@ class IIDM(OfFiveParameters):
     """
 
     kind: ClassVar[str] = "iidm"
-    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2013,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2013"],)
     adds: ClassVar[bool] = False
     title: ClassVar[str] = "improved IDM"
     equation: ClassVar[str] = "f (1 − z^(2a/f)) for z = s*/s < 1, a (1 − z²) above; f = a (1 − (v/v0)⁴)"
@@ -96,7 +96,7 @@ class FVDM(CarFollowing):
     """
 
     kind: ClassVar[str] = "fvdm"
-    sources: ClassVar[tuple[str, ...]] = (references.JIANG_2001,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["jiang_2001"],)
     adds: ClassVar[bool] = True  # its answer to an empty road is κ v0, more than tyres hold
     title: ClassVar[str] = "full velocity difference model"
     equation: ClassVar[str] = "κ (V(s) − v) + λ (v_lead − v)"
@@ -141,7 +141,7 @@ class Gipps(CarFollowing):
     """
 
     kind: ClassVar[str] = "gipps"
-    sources: ClassVar[tuple[str, ...]] = (references.GIPPS_1981,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["gipps_1981"],)
     adds: ClassVar[bool] = False
     title: ClassVar[str] = "Gipps' model"
     equation: ClassVar[str] = "(min(v_free, v_safe) − v)/τ"
@@ -186,7 +186,7 @@ class ConstantTimeGap(OfFiveParameters):
     """
 
     kind: ClassVar[str] = "constant_time_gap"
-    sources: ClassVar[tuple[str, ...]] = (references.MILANES_2014, references.XIAO_2017)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["milanes_2014"], PUBLICATIONS["xiao_2017"])
     adds: ClassVar[bool] = False
     title: ClassVar[str] = "linear constant time gap"
     equation: ClassVar[str] = "min(k_s (s − s0 − v T) + k_v (v_lead − v) + c a_lead, k_0 (v0 − v)), limited and lagged"

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from idm_env.effects import references
 from idm_env.effects.base import CarFollowing, P
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import FAR, Driver, Scene
 
@@ -110,7 +110,7 @@ class IDM(OfFiveParameters):
     """
 
     kind: ClassVar[str] = "idm"
-    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2000,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2000"],)
     adds: ClassVar[bool] = False
     title: ClassVar[str] = "IDM"
     equation: ClassVar[str] = "a [1 − (v/v0)⁴ − (s*/s)²]"

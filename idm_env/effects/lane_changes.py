@@ -9,9 +9,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import references
 from idm_env.effects.base import Effect, P
 from idm_env.effects.idm import interaction
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Beside, Driver, Scene, Wish
 
@@ -61,7 +61,7 @@ class Mobil(Effect):
     """
 
     kind: ClassVar[str] = "mobil"
-    sources: ClassVar[tuple[str, ...]] = (references.KESTING_2007,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["kesting_2007"],)
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("politeness", "p", "1", 0.2, -1.0, 2.0, role="shape"),
         Parameter("threshold", "Δa_th", "m/s²", 0.1, 0.0, 5.0, role="threshold"),
@@ -117,7 +117,7 @@ class MandatoryChange(Effect):
     """
 
     kind: ClassVar[str] = "mandatory_change"
-    sources: ClassVar[tuple[str, ...]] = (references.KESTING_2007,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["kesting_2007"],)
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("strength", "A", "m/s²", 4.0, 0.0, 100.0, role="shape"),
         Parameter("reach", "D", "m", 300.0, 1.0, 5000.0, role="shape"),
@@ -163,7 +163,7 @@ class GapAcceptance(Effect):
     """
 
     kind: ClassVar[str] = "gap_acceptance"
-    sources: ClassVar[tuple[str, ...]] = (references.SCHAKEL_2012,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["schakel_2012"],)
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("strength", "c", "1", 1.0, 0.0, 1.0, null=0.0),
         Parameter("reach", "D", "m", 300.0, 1.0, 5000.0, role="shape"),

@@ -9,9 +9,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import references
 from idm_env.effects.base import Effect, P
 from idm_env.effects.idm import soft_floor
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
 
@@ -21,7 +21,7 @@ class Asymmetry(Effect):
     """Weaker acceleration than braking: ``a > 0: (1 − k) a``, ``a < 0: (1 + k) a`` (Newell; Laval and Leclercq)."""
 
     kind: ClassVar[str] = "asymmetry"
-    sources: ClassVar[tuple[str, ...]] = (references.NEWELL_1965, references.LAVAL_2010)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["newell_1965"], PUBLICATIONS["laval_2010"])
     title: ClassVar[str] = "asymmetry"
     equation: ClassVar[str] = "a > 0: (1 − k) a, a < 0: (1 + k) a"
     wording: ClassVar[tuple[str, str]] = (
@@ -50,7 +50,7 @@ class ActionPoint(Effect):
     """
 
     kind: ClassVar[str] = "action_point"
-    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2018,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2018"],)
     adds: ClassVar[bool] = False
     title: ClassVar[str] = "action points"
     equation: ClassVar[str] = "a is held until the wanted one differs by Δa"
@@ -175,7 +175,7 @@ class Traction(Effect):
     """
 
     kind: ClassVar[str] = "traction"
-    sources: ClassVar[tuple[str, ...]] = (references.RAJAMANI_2012,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["rajamani_2012"],)
     rank: ClassVar[int] = 90
     sees_truth: ClassVar[bool] = True
     adds: ClassVar[bool] = False

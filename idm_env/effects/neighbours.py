@@ -11,9 +11,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import references
 from idm_env.effects.base import Effect, Neighbour, P, Sought
 from idm_env.effects.idm import SMALLEST_GAP, free_accel, interaction
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Adjacent, Driver, Scene
 
@@ -29,7 +29,7 @@ class SecondLeader(Effect):
     """
 
     kind: ClassVar[str] = "second_leader"
-    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2006,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2006"],)
     title: ClassVar[str] = "second leader"
     equation: ClassVar[str] = "(1 − w) (s*₁/s₁)² + w (s*₂/(s₂/2))² in place of (s*₁/s₁)²"
     wording: ClassVar[tuple[str, str]] = (
@@ -152,7 +152,7 @@ class Courtesy(Effect):
 
     kind: ClassVar[str] = "courtesy"
     sought: ClassVar[Sought] = "never"
-    sources: ClassVar[tuple[str, ...]] = (references.SCHAKEL_2012,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["schakel_2012"],)
     adds: ClassVar[bool] = True  # a weight below 0 keeps others out
     title: ClassVar[str] = "courtesy"
     equation: ClassVar[str] = "− w min(b, v / 1 s, a max(0, (s*_m/s_m)² − (s*/s)²))"
@@ -208,7 +208,7 @@ class Calm(Effect):
 
     kind: ClassVar[str] = "calm"
     sought: ClassVar[Sought] = "never"
-    sources: ClassVar[tuple[str, ...]] = (references.KESTING_2010,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["kesting_2010"],)
     adds: ClassVar[bool] = True
     title: ClassVar[str] = "calm behind who cuts in"
     equation: ClassVar[str] = "+ c max(0, a_CAH + b tanh((a_IDM − a_CAH)/b) − a_IDM)"

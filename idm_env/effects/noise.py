@@ -17,8 +17,8 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from idm_env.effects import references
 from idm_env.effects.base import Effect, P
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
 
@@ -91,7 +91,7 @@ class Wander(Effect):
     """
 
     kind: ClassVar[str] = "wander"
-    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2006,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2006"],)
     draws: ClassVar[bool] = True
     rank: ClassVar[int] = 5
     title: ClassVar[str] = "wandering style"
@@ -134,7 +134,7 @@ class PerceptionNoise(Effect):
     """
 
     kind: ClassVar[str] = "perception_noise"
-    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2006,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2006"],)
     draws: ClassVar[bool] = True
     title: ClassVar[str] = "drifting errors of perception"
     equation: ClassVar[str] = "s e^(σ n) or Δv + σ s n, dn = −n dt/τ + √(2/τ) dW"

@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import torch
 
-from idm_env.effects import references
 from idm_env.effects.base import Effect, P, Sought
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Imagined, Neighbour, Scene
 
@@ -23,7 +23,7 @@ class Delay(Effect):
     """
 
     kind: ClassVar[str] = "delay"
-    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2006,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2006"],)
     rank: ClassVar[int] = -10
     title: ClassVar[str] = "reaction delay"
     equation: ClassVar[str] = "all that is seen is taken at t − τ"
@@ -60,7 +60,7 @@ class DeadZone(Effect):
     """
 
     kind: ClassVar[str] = "dead_zone"
-    sources: ClassVar[tuple[str, ...]] = (references.WIEDEMANN_1974,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["wiedemann_1974"],)
     title: ClassVar[str] = "threshold of looming"
     equation: ClassVar[str] = "Δv is seen as 0 while 1.8 |Δv| / s² < θ"
     wording: ClassVar[tuple[str, str]] = ("", "drivers do not notice the small closing speeds that {law} reacts to")
@@ -92,7 +92,7 @@ class ClosingGain(Effect):
 
     kind: ClassVar[str] = "closing_gain"
     sought: ClassVar[Sought] = "never"
-    sources: ClassVar[tuple[str, ...]] = (references.MILANES_2014,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["milanes_2014"],)
     title: ClassVar[str] = "gain on the closing speed"
     equation: ClassVar[str] = "Δv is seen as k Δv"
     wording: ClassVar[tuple[str, str]] = (

@@ -8,9 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import references
 from idm_env.effects.base import Effect, P, Sought
 from idm_env.effects.places import along, curve, rising
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
 
@@ -73,7 +73,7 @@ class CurveSpeed(Effect):
     """
 
     kind: ClassVar[str] = "curve_speed"
-    sources: ClassVar[tuple[str, ...]] = (references.REYMOND_2001,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["reymond_2001"],)
     title: ClassVar[str] = "speed in bends"
     equation: ClassVar[str] = "v0 → min(v0, √(a_lat / |κ(x)|))"
     wording: ClassVar[tuple[str, str]] = (

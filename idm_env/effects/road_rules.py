@@ -10,9 +10,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import references
 from idm_env.effects.base import Effect, P
 from idm_env.effects.idm import interaction
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import FAR, Driver, Mark, Scene, Wish
 
@@ -197,7 +197,7 @@ class Destination(Effect):
     """
 
     kind: ClassVar[str] = "destination"
-    sources: ClassVar[tuple[str, ...]] = (references.SCHAKEL_2012,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["schakel_2012"],)
     needs: ClassVar[frozenset[str]] = frozenset({"lane"})
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("first", "k_1", "1", 0.0, 0.0, 1000.0, role="shape"),

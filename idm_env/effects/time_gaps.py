@@ -8,9 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import references
 from idm_env.effects.base import Effect, P
 from idm_env.effects.idm import SMALLEST_GAP, equilibrium_gap
+from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
 
@@ -24,7 +24,7 @@ class SpeedTimeGap(Effect):
     """
 
     kind: ClassVar[str] = "speed_time_gap"
-    sources: ClassVar[tuple[str, ...]] = (references.ZHOU_2005,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["zhou_2005"],)
     rank: ClassVar[int] = 2
     title: ClassVar[str] = "speed-dependent time gap"
     equation: ClassVar[str] = "T → T (1 + k (v / (20 m/s) − 1))"
@@ -56,7 +56,7 @@ class SetPointAsymmetry(Effect):
     """
 
     kind: ClassVar[str] = "set_point_asymmetry"
-    sources: ClassVar[tuple[str, ...]] = (references.NEWELL_1965, references.YEO_2009)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["newell_1965"], PUBLICATIONS["yeo_2009"])
     rank: ClassVar[int] = 2
     title: ClassVar[str] = "asymmetric time gap"
     equation: ClassVar[str] = "T → T (1 + k a_lead / √(a_lead² + 0.09 m²/s⁴))"
@@ -97,7 +97,7 @@ class Relaxation(Effect):
     """
 
     kind: ClassVar[str] = "relaxation"
-    sources: ClassVar[tuple[str, ...]] = (references.LAVAL_2008,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["laval_2008"],)
     rank: ClassVar[int] = 2
     title: ClassVar[str] = "relaxation of the time gap"
     equation: ClassVar[str] = "T → T (1 + β (m − 1)), τ dm/dt = s √(1 − (v/v0)⁴) / (s0 + v T) − m"
@@ -152,7 +152,7 @@ class LeaderTrend(Effect):
     """
 
     kind: ClassVar[str] = "leader_trend"
-    sources: ClassVar[tuple[str, ...]] = (references.ZHANG_2005, references.YEO_2009)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["zhang_2005"], PUBLICATIONS["yeo_2009"])
     rank: ClassVar[int] = 2
     title: ClassVar[str] = "time gap by the leader's trend"
     equation: ClassVar[str] = "T → T κ^x, x = (v_lead − m) / (3 m/s), τ dm/dt = v_lead − m"
@@ -205,7 +205,7 @@ class GapStiffness(Effect):
     """
 
     kind: ClassVar[str] = "gap_stiffness"
-    sources: ClassVar[tuple[str, ...]] = (references.MILANES_2014,)
+    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["milanes_2014"],)
     rank: ClassVar[int] = 3
     title: ClassVar[str] = "stiffness of the pull to one's own gap"
     equation: ClassVar[str] = "s* → s* (s/s_e)^(1 − w), s_e = (s0 + v T)/√(1 − (v/v0)⁴)"
