@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -22,11 +21,11 @@ class Control(Effect):
     ``command + driver``, so that no command is human driving (Johannink et al. 2019).
     """
 
-    kind: ClassVar[str] = "control"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["johannink_2019"],)
-    takes: ClassVar[type | None] = Command
-    adds: ClassVar[bool] = False
-    rank: ClassVar[int] = 35
+    kind = "control"
+    sources = (PUBLICATIONS["johannink_2019"],)
+    takes = Command
+    adds = False
+    rank = 35
     careful: bool = False
     added: bool = False
 
@@ -45,8 +44,8 @@ class Replay(Effect):
     Input ``replay``: a ``Record``, holding the record at the end of the step.
     """
 
-    kind: ClassVar[str] = "replay"
-    takes: ClassVar[type | None] = Record
+    kind = "replay"
+    takes = Record
 
     def place(self, motion: Motion, scene: Scene, p: P) -> Motion:
         """Return the record where active."""

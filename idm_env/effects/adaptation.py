@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from idm_env.effects.base import Effect, P, Sought
+from idm_env.effects.base import Effect, P
 from idm_env.effects.places import along, smooth_step, window
 from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
@@ -19,21 +18,19 @@ from idm_env.types import Driver, Scene
 class SpeedDependentGap(Effect):
     """``s* += s1 √(v/v0)`` (Treiber, Hennecke, Helbing 2000), with √ continued linearly below v/v0 = 10⁻³."""
 
-    kind: ClassVar[str] = "speed_dependent_gap"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2000"],)
-    rank: ClassVar[int] = 4
-    title: ClassVar[str] = "speed-dependent gap"
-    equation: ClassVar[str] = "s* += s1 √(v/v0)"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "speed_dependent_gap"
+    sources = (PUBLICATIONS["treiber_2000"],)
+    rank = 4
+    title = "speed-dependent gap"
+    equation = "s* += s1 √(v/v0)"
+    wording = (
         "drivers keep shorter gaps at speed than {law}'s constant time gap",
         "drivers keep longer gaps at speed than {law}'s constant time gap",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("drag", "time_gap")
-    told_by: ClassVar[str] = "following at 5 to 30 m/s by one driver tells the gap from drag"
-    acts_on: ClassVar[str] = "desired_gap"
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("extra_gap", "s1", "m", 3.0, -10.0, 15.0, null=0.0, starts=(0.5,)),
-    )
+    looks_like = ("drag", "time_gap")
+    told_by = "following at 5 to 30 m/s by one driver tells the gap from drag"
+    acts_on = "desired_gap"
+    declared = (Parameter("extra_gap", "s1", "m", 3.0, -10.0, 15.0, null=0.0, starts=(0.5,)),)
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the longer desired gap."""
@@ -50,18 +47,18 @@ class LongMemory(Effect):
     constant v/v0.
     """
 
-    kind: ClassVar[str] = "memory"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2003"],)
-    title: ClassVar[str] = "memory of congestion"
-    equation: ClassVar[str] = "T (1 + β (1 − λ)), τ dλ/dt = v/v0 − λ"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "memory"
+    sources = (PUBLICATIONS["treiber_2003"],)
+    title = "memory of congestion"
+    equation = "T (1 + β (1 − λ)), τ dλ/dt = v/v0 − λ"
+    wording = (
         "drivers keep shorter time gaps the longer they have driven slowly, where {law} keeps one",
         "drivers keep longer time gaps the longer they have driven slowly, where {law} keeps one",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("regime_shift", "time_gap")
-    told_by: ClassVar[str] = "runs that begin at different times of the day tell memory from a shift of regime"
-    acts_on: ClassVar[str] = "time_gap"
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    looks_like = ("regime_shift", "time_gap")
+    told_by = "runs that begin at different times of the day tell memory from a shift of regime"
+    acts_on = "time_gap"
+    declared = (
         Parameter("strength", "β", "1", 0.5, -0.9, 3.0, null=0.0, starts=(0.5,)),
         Parameter("memory_time", "τ", "s", 60.0, 5.0, 900.0, role="shape", starts=(30.0, 150.0)),
     )
@@ -87,19 +84,19 @@ class SpeedZone(Effect):
     Places are in the position's coordinate, on a lap of ``period`` metres where given.
     """
 
-    kind: ClassVar[str] = "speed_zone"
-    title: ClassVar[str] = "speed zone"
-    equation: ClassVar[str] = "v0 → f v0 between x1 and x2"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "speed_zone"
+    title = "speed zone"
+    equation = "v0 → f v0 between x1 and x2"
+    wording = (
         "drivers want to go slower in one stretch of the road, where {law} has one desired speed",
         "drivers want to go faster in one stretch of the road, where {law} has one desired speed",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("grade", "time_gap over position")
-    told_by: ClassVar[str] = "the same place at low and high speed, with and without leader, tells a zone from a grade"
-    sought: ClassVar[Sought] = "interval"
-    acts_on: ClassVar[str] = "desired_speed"
-    rank: ClassVar[int] = 1
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    looks_like = ("grade", "time_gap over position")
+    told_by = "the same place at low and high speed, with and without leader, tells a zone from a grade"
+    sought = "interval"
+    acts_on = "desired_speed"
+    rank = 1
+    declared = (
         Parameter("factor", "f", "1", 0.7, 0.2, 2.0, null=1.0),
         Parameter("begin", "x1", "m", 200.0, -1e6, 1e6, role="place"),
         Parameter("end", "x2", "m", 500.0, -1e6, 1e6, role="place"),
@@ -123,19 +120,19 @@ class SpeedZone(Effect):
 class RegimeShift(Effect):
     """``T → T (1 + k)`` after time t* (rain, darkness); the step is smooth over ``width`` (s)."""
 
-    kind: ClassVar[str] = "regime_shift"
-    title: ClassVar[str] = "shift of regime"
-    equation: ClassVar[str] = "T → T (1 + k) after t*"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "regime_shift"
+    title = "shift of regime"
+    equation = "T → T (1 + k) after t*"
+    wording = (
         "drivers keep shorter time gaps from one moment on, where {law} keeps one",
         "drivers keep longer time gaps from one moment on, where {law} keeps one",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("memory", "time_gap over time")
-    told_by: ClassVar[str] = "runs with different clock offsets tell a shift of regime from memory"
-    sought: ClassVar[Sought] = "step"
-    acts_on: ClassVar[str] = "time_gap"
-    rank: ClassVar[int] = 2
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    looks_like = ("memory", "time_gap over time")
+    told_by = "runs with different clock offsets tell a shift of regime from memory"
+    sought = "step"
+    acts_on = "time_gap"
+    rank = 2
+    declared = (
         Parameter("strength", "k", "1", 0.3, -0.8, 3.0, null=0.0),
         Parameter("time", "t*", "s", 60.0, -1e7, 1e7, role="place"),
     )

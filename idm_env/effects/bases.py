@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -33,12 +32,12 @@ class IDMPlus(OfFiveParameters):
     with IDM's s*. Its equilibrium gap is s0 + v T at every speed below v0, where IDM's is longer.
     """
 
-    kind: ClassVar[str] = "idm_plus"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["schakel_2010"],)
-    adds: ClassVar[bool] = False
-    title: ClassVar[str] = "IDM+"
-    equation: ClassVar[str] = "a min(1 − (v/v0)⁴, 1 − (s*/s)²)"
-    declared: ClassVar[tuple[Parameter, ...]] = FIVE
+    kind = "idm_plus"
+    sources = (PUBLICATIONS["schakel_2010"],)
+    adds = False
+    title = "IDM+"
+    equation = "a min(1 − (v/v0)⁴, 1 − (s*/s)²)"
+    declared = FIVE
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return A (m/s²)."""
@@ -59,12 +58,12 @@ class IIDM(OfFiveParameters):
     Its equilibrium gap is s0 + v T at every speed below v0, and no driver above v0 brakes harder than b for that alone.
     """
 
-    kind: ClassVar[str] = "iidm"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2013"],)
-    adds: ClassVar[bool] = False
-    title: ClassVar[str] = "improved IDM"
-    equation: ClassVar[str] = "f (1 − z^(2a/f)) for z = s*/s < 1, a (1 − z²) above; f = a (1 − (v/v0)⁴)"
-    declared: ClassVar[tuple[Parameter, ...]] = FIVE
+    kind = "iidm"
+    sources = (PUBLICATIONS["treiber_2013"],)
+    adds = False
+    title = "improved IDM"
+    equation = "f (1 − z^(2a/f)) for z = s*/s < 1, a (1 − z²) above; f = a (1 − (v/v0)⁴)"
+    declared = FIVE
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return A (m/s²)."""
@@ -95,12 +94,12 @@ class FVDM(CarFollowing):
     nothing at twice that, where the published term ends at once.
     """
 
-    kind: ClassVar[str] = "fvdm"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["jiang_2001"],)
-    adds: ClassVar[bool] = True  # its answer to an empty road is κ v0, more than tyres hold
-    title: ClassVar[str] = "full velocity difference model"
-    equation: ClassVar[str] = "κ (V(s) − v) + λ (v_lead − v)"
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    kind = "fvdm"
+    sources = (PUBLICATIONS["jiang_2001"],)
+    adds = True  # its answer to an empty road is κ v0, more than tyres hold
+    title = "full velocity difference model"
+    equation = "κ (V(s) − v) + λ (v_lead − v)"
+    declared = (
         Parameter("sensitivity", "κ", "1/s", 0.41, 0.02, 3.0, role="shape"),
         Parameter("speed_gain", "λ", "1/s", 0.5, 0.01, 3.0, role="shape"),
         Parameter("time_gap", "T", "s", 1.0, 0.1, 5.0, role="shape"),
@@ -140,12 +139,12 @@ class Gipps(CarFollowing):
     late, which the effect ``delay`` would add. The gap in equilibrium is s0 + 1.5 v τ + v² (1/b − 1/b̂)/2.
     """
 
-    kind: ClassVar[str] = "gipps"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["gipps_1981"],)
-    adds: ClassVar[bool] = False
-    title: ClassVar[str] = "Gipps' model"
-    equation: ClassVar[str] = "(min(v_free, v_safe) − v)/τ"
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    kind = "gipps"
+    sources = (PUBLICATIONS["gipps_1981"],)
+    adds = False
+    title = "Gipps' model"
+    equation = "(min(v_free, v_safe) − v)/τ"
+    declared = (
         Parameter("max_accel", "a", "m/s²", 1.7, 0.1, 10.0, role="shape"),
         Parameter("comfort_decel", "b", "m/s²", 3.4, 0.2, 10.0, role="shape"),
         Parameter("lead_decel", "b̂", "m/s²", 3.2, 0.2, 10.0, role="shape"),
@@ -185,12 +184,12 @@ class ConstantTimeGap(OfFiveParameters):
     leader to the vehicle speeds go by ``(c z² + k_v z + k_s)/(τ z³ + z² + (k_s T + k_v) z + k_s)``, z being Laplace's.
     """
 
-    kind: ClassVar[str] = "constant_time_gap"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["milanes_2014"], PUBLICATIONS["xiao_2017"])
-    adds: ClassVar[bool] = False
-    title: ClassVar[str] = "linear constant time gap"
-    equation: ClassVar[str] = "min(k_s (s − s0 − v T) + k_v (v_lead − v) + c a_lead, k_0 (v0 − v)), limited and lagged"
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    kind = "constant_time_gap"
+    sources = (PUBLICATIONS["milanes_2014"], PUBLICATIONS["xiao_2017"])
+    adds = False
+    title = "linear constant time gap"
+    equation = "min(k_s (s − s0 − v T) + k_v (v_lead − v) + c a_lead, k_0 (v0 − v)), limited and lagged"
+    declared = (
         Parameter("gap_gain", "k_s", "1/s²", 0.23, 0.002, 2.0, role="shape"),
         Parameter("speed_gain", "k_v", "1/s", 0.07, 0.005, 3.0, role="shape"),
         Parameter("feed_forward", "c", "1", 0.1, 0.005, 1.0, role="shape"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -145,7 +145,7 @@ class Curve(OverFeature, Effect):  # type: ignore[misc, override]
     ``number`` tells curves of one quantity over one feature apart, such as those with other knots.
     """
 
-    kind: ClassVar[str] = "curve"
+    kind = "curve"
     feature: str = "speed"
     knots: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0)
     period: float | None = None
@@ -182,8 +182,8 @@ class DriverCurve(OverFeature, Effect):  # type: ignore[misc, override]
     ``by`` and ``number`` are those of ``Curve``.
     """
 
-    kind: ClassVar[str] = "driver_curve"
-    rank: ClassVar[int] = 3
+    kind = "driver_curve"
+    rank = 3
     target: Target = "time_gap"
     feature: str = "position"
     knots: tuple[float, ...] = (0.0, 500.0, 1000.0)

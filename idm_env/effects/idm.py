@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -109,12 +108,12 @@ class IDM(OfFiveParameters):
     (so gap 0 is a division by zero there and an overlap looks like a gap: use it to reproduce, not to drive).
     """
 
-    kind: ClassVar[str] = "idm"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2000"],)
-    adds: ClassVar[bool] = False
-    title: ClassVar[str] = "IDM"
-    equation: ClassVar[str] = "a [1 − (v/v0)⁴ − (s*/s)²]"
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    kind = "idm"
+    sources = (PUBLICATIONS["treiber_2000"],)
+    adds = False
+    title = "IDM"
+    equation = "a [1 − (v/v0)⁴ − (s*/s)²]"
+    declared = (
         Parameter("max_accel", "a", "m/s²", 1.4, 0.1, 10.0, role="shape"),
         Parameter("comfort_decel", "b", "m/s²", 2.0, 0.1, 10.0, role="shape"),
         Parameter("time_gap", "T", "s", 1.5, 0.1, 5.0, role="shape"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -60,9 +59,9 @@ class Mobil(Effect):
     ``stagger``, that many slots at once (at least 256), blocks taking turns a step apart. ValueError for fewer.
     """
 
-    kind: ClassVar[str] = "mobil"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["kesting_2007"],)
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    kind = "mobil"
+    sources = (PUBLICATIONS["kesting_2007"],)
+    declared = (
         Parameter("politeness", "p", "1", 0.2, -1.0, 2.0, role="shape"),
         Parameter("threshold", "Δa_th", "m/s²", 0.1, 0.0, 5.0, role="threshold"),
         _SAFE_DECEL,
@@ -116,9 +115,9 @@ class MandatoryChange(Effect):
     3 m/s, feels an urgency of ``(1 − z) u`` until he is the first at the end; 0 is nobody waiting for his turn.
     """
 
-    kind: ClassVar[str] = "mandatory_change"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["kesting_2007"],)
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    kind = "mandatory_change"
+    sources = (PUBLICATIONS["kesting_2007"],)
+    declared = (
         Parameter("strength", "A", "m/s²", 4.0, 0.0, 100.0, role="shape"),
         Parameter("reach", "D", "m", 300.0, 1.0, 5000.0, role="shape"),
         _SAFE_DECEL,
@@ -162,9 +161,9 @@ class GapAcceptance(Effect):
     last line, where v and s are the follower's and the driver's own. Absent at c = 0.
     """
 
-    kind: ClassVar[str] = "gap_acceptance"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["schakel_2012"],)
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    kind = "gap_acceptance"
+    sources = (PUBLICATIONS["schakel_2012"],)
+    declared = (
         Parameter("strength", "c", "1", 1.0, 0.0, 1.0, null=0.0),
         Parameter("reach", "D", "m", 300.0, 1.0, 5000.0, role="shape"),
         Parameter("closer", "γ", "1", 0.8, 0.0, 0.9, role="shape"),
@@ -243,9 +242,9 @@ class LaneCommand(Effect):
     the road, is not done but counted (``lanes.blocked``), and so is what another claim wins (``lanes.refused``).
     """
 
-    kind: ClassVar[str] = "lane_command"
-    takes: ClassVar[type | None] = Tensor
-    declared: ClassVar[tuple[Parameter, ...]] = (_SAFE_DECEL,)
+    kind = "lane_command"
+    takes = Tensor
+    declared = (_SAFE_DECEL,)
 
     def change(self, scene: Scene, driver: Driver, p: P) -> Wish:
         """Return a utility that outweighs every driver's."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -20,22 +19,20 @@ from idm_env.types import Driver, Scene
 class Asymmetry(Effect):
     """Weaker acceleration than braking: ``a > 0: (1 − k) a``, ``a < 0: (1 + k) a`` (Newell; Laval and Leclercq)."""
 
-    kind: ClassVar[str] = "asymmetry"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["newell_1965"], PUBLICATIONS["laval_2010"])
-    title: ClassVar[str] = "asymmetry"
-    equation: ClassVar[str] = "a > 0: (1 − k) a, a < 0: (1 + k) a"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "asymmetry"
+    sources = (PUBLICATIONS["newell_1965"], PUBLICATIONS["laval_2010"])
+    title = "asymmetry"
+    equation = "a > 0: (1 − k) a, a < 0: (1 + k) a"
+    wording = (
         "drivers accelerate harder and brake softer than {law}",
         "drivers accelerate softer and brake harder than {law}",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("brake_light", "max_accel and comfort_decel together")
-    told_by: ClassVar[str] = (
+    looks_like = ("brake_light", "max_accel and comfort_decel together")
+    told_by = (
         "accelerating and braking on a free road, where no leader sets the pace, tells asymmetry from brake lights"
     )
-    rank: ClassVar[int] = 10
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("strength", "k", "1", 0.3, -0.9, 0.9, null=0.0, starts=(0.05,)),
-    )
+    rank = 10
+    declared = (Parameter("strength", "k", "1", 0.3, -0.9, 0.9, null=0.0, starts=(0.05,)),)
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return ``a − k |a|``."""
@@ -49,25 +46,23 @@ class ActionPoint(Effect):
     Δa has no gradient: search from the ``starts``.
     """
 
-    kind: ClassVar[str] = "action_point"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2018"],)
-    adds: ClassVar[bool] = False
-    title: ClassVar[str] = "action points"
-    equation: ClassVar[str] = "a is held until the wanted one differs by Δa"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "action_point"
+    sources = (PUBLICATIONS["treiber_2018"],)
+    adds = False
+    title = "action points"
+    equation = "a is held until the wanted one differs by Δa"
+    wording = (
         "",
         "drivers hold an acceleration until a clearly different one is wanted, where {law} adjusts all the time",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("lag", "leader_acceleration")
-    told_by: ClassVar[str] = (
+    looks_like = ("lag", "leader_acceleration")
+    told_by = (
         "accelerations measured at 10 Hz or more (steps, and stretches without change) tell action points from lag"
     )
-    acts_on: ClassVar[str] = "response"
-    wind_up_s: ClassVar[float] = 2.0
-    rank: ClassVar[int] = 30
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("threshold", "Δa", "m/s²", 0.3, 0.0, 2.0, null=0.0, role="threshold", starts=(0.15, 0.4)),
-    )
+    acts_on = "response"
+    wind_up_s = 2.0
+    rank = 30
+    declared = (Parameter("threshold", "Δa", "m/s²", 0.3, 0.0, 2.0, null=0.0, role="threshold", starts=(0.15, 0.4)),)
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the held acceleration, or the wanted one where it differs enough."""
@@ -78,19 +73,16 @@ class ActionPoint(Effect):
 class PowerLimit(Effect):
     """``a ≤ (P/m) / v`` with specific power P/m (W/kg); absent at its null, a power that no car has."""
 
-    kind: ClassVar[str] = "power_limit"
-    adds: ClassVar[bool] = False
-    title: ClassVar[str] = "power limit"
-    equation: ClassVar[str] = "a ≤ (P/m) / v"
-    wording: ClassVar[tuple[str, str]] = (
-        "vehicles accelerate less at high speed than {law}, as an engine's power allows",
-        "",
-    )
-    looks_like: ClassVar[tuple[str, ...]] = ("drag", "desired_speed")
-    told_by: ClassVar[str] = "free starts from standstill to above 25 m/s tell power from drag and v0"
-    rank: ClassVar[int] = 40
-    sees_truth: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    kind = "power_limit"
+    adds = False
+    title = "power limit"
+    equation = "a ≤ (P/m) / v"
+    wording = ("vehicles accelerate less at high speed than {law}, as an engine's power allows", "")
+    looks_like = ("drag", "desired_speed")
+    told_by = "free starts from standstill to above 25 m/s tell power from drag and v0"
+    rank = 40
+    sees_truth = True
+    declared = (
         Parameter(
             "power", "P/m", "W/kg", 15.0, 2.0, 100.0, 1e5, role="threshold", starts=(10.0, 18.0), searched=(2.0, 60.0)
         ),
@@ -108,24 +100,19 @@ class Lag(Effect):
     A is the acceleration of the step before.
     """
 
-    kind: ClassVar[str] = "lag"
-    adds: ClassVar[bool] = False
-    title: ClassVar[str] = "response lag"
-    equation: ClassVar[str] = "τ dA/dt = a − A"
-    wording: ClassVar[tuple[str, str]] = (
-        "",
-        "vehicles take longer than {law} to reach the acceleration that is wanted",
-    )
-    looks_like: ClassVar[tuple[str, ...]] = ("delay", "leader_acceleration with the other sign", "action_point")
-    told_by: ClassVar[str] = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells lag from delay"
-    latency: ClassVar[bool] = True
-    acts_on: ClassVar[str] = "response"
-    wind_up_s: ClassVar[float] = 2.0
-    rank: ClassVar[int] = 50
-    sees_truth: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("lag", "τ", "s", 0.5, 0.0, 3.0, null=0.0, starts=(0.3, 0.8), searched=(0.0, 2.0)),
-    )
+    kind = "lag"
+    adds = False
+    title = "response lag"
+    equation = "τ dA/dt = a − A"
+    wording = ("", "vehicles take longer than {law} to reach the acceleration that is wanted")
+    looks_like = ("delay", "leader_acceleration with the other sign", "action_point")
+    told_by = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells lag from delay"
+    latency = True
+    acts_on = "response"
+    wind_up_s = 2.0
+    rank = 50
+    sees_truth = True
+    declared = (Parameter("lag", "τ", "s", 0.5, 0.0, 3.0, null=0.0, starts=(0.3, 0.8), searched=(0.0, 2.0)),)
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the lagged acceleration."""
@@ -145,11 +132,11 @@ class Brakes(Effect):
     paper's; it lifts every acceleration and lets a vehicle creep towards a parked leader.
     """
 
-    kind: ClassVar[str] = "brakes"
-    adds: ClassVar[bool] = False
-    rank: ClassVar[int] = 60
-    sees_truth: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("max_decel", "b_max", "m/s²", 9.0, 1.0, 15.0, role="shape"),)
+    kind = "brakes"
+    adds = False
+    rank = 60
+    sees_truth = True
+    declared = (Parameter("max_decel", "b_max", "m/s²", 9.0, 1.0, 15.0, role="shape"),)
     width: float = 0.1
     sharpness: float | None = None
 
@@ -174,14 +161,12 @@ class Traction(Effect):
     give another maximum, or its null to be rid of it. Below the maximum it changes no bit; above, its gradient is zero.
     """
 
-    kind: ClassVar[str] = "traction"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["rajamani_2012"],)
-    rank: ClassVar[int] = 90
-    sees_truth: ClassVar[bool] = True
-    adds: ClassVar[bool] = False
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("max_accel", "μ g", "m/s²", 10.0, 1.0, 15.0, null=1e5, role="threshold"),
-    )
+    kind = "traction"
+    sources = (PUBLICATIONS["rajamani_2012"],)
+    rank = 90
+    sees_truth = True
+    adds = False
+    declared = (Parameter("max_accel", "μ g", "m/s²", 10.0, 1.0, 15.0, null=1e5, role="threshold"),)
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the acceleration that the tyres allow."""

@@ -6,12 +6,11 @@ Where the neighbour is missing each of these is exactly absent.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from idm_env.effects.base import Effect, Neighbour, P, Sought
+from idm_env.effects.base import Effect, P
 from idm_env.effects.idm import SMALLEST_GAP, free_accel, interaction
 from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
@@ -28,23 +27,21 @@ class SecondLeader(Effect):
     Source: Treiber, Kesting, Helbing 2006, Physica A 360, 71; s₂ is the bumper gap to the second leader (m).
     """
 
-    kind: ClassVar[str] = "second_leader"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2006"],)
-    title: ClassVar[str] = "second leader"
-    equation: ClassVar[str] = "(1 − w) (s*₁/s₁)² + w (s*₂/(s₂/2))² in place of (s*₁/s₁)²"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "second_leader"
+    sources = (PUBLICATIONS["treiber_2006"],)
+    title = "second leader"
+    equation = "(1 − w) (s*₁/s₁)² + w (s*₂/(s₂/2))² in place of (s*₁/s₁)²"
+    wording = (
         "drivers go by their own leader even more than {law}, against what the vehicle ahead of it does",
         "drivers look past their leader to the vehicle ahead of it, which {law} does not see",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("brake_light", "leader_acceleration", "delay")
-    told_by: ClassVar[str] = (
+    looks_like = ("brake_light", "leader_acceleration", "delay")
+    told_by = (
         "leaders that brake without their own leaders braking, and the reverse, tell a second leader from brake lights"
     )
-    beyond: ClassVar[Neighbour] = "second leader"
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("weight", "w", "1", 0.3, -0.5, 1.0, null=0.0, starts=(0.1,)),
-    )
-    needs: ClassVar[frozenset[str]] = frozenset({"second_leader"})
+    beyond = "second leader"
+    declared = (Parameter("weight", "w", "1", 0.3, -0.5, 1.0, null=0.0, starts=(0.1,)),)
+    needs = frozenset({"second_leader"})
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the difference that the second leader makes (m/s²)."""
@@ -63,21 +60,19 @@ class LeaderAcceleration(Effect):
     multiplied by c from vehicle to vehicle, so that beyond c = ±1 they grow without end: it is not string stable.
     """
 
-    kind: ClassVar[str] = "leader_acceleration"
-    title: ClassVar[str] = "leader's acceleration"
-    equation: ClassVar[str] = "+ c a_lead"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "leader_acceleration"
+    title = "leader's acceleration"
+    equation = "+ c a_lead"
+    wording = (
         "drivers answer their leader's acceleration with the opposite sign, as late ones do",
         "drivers follow their leader's acceleration at once, which {law} does not see",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("delay", "lag", "brake_light", "second_leader")
-    told_by: ClassVar[str] = (
+    looks_like = ("delay", "lag", "brake_light", "second_leader")
+    told_by = (
         "leaders that accelerate as sharply as they brake tell it from brake lights, sharp steps of speed from a delay"
     )
-    sees_truth: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("gain", "c", "1", 0.4, -0.95, 0.95, null=0.0, starts=(0.1,)),
-    )
+    sees_truth = True
+    declared = (Parameter("gain", "c", "1", 0.4, -0.95, 0.95, null=0.0, starts=(0.1,)),)
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return c a_lead (m/s²)."""
@@ -88,18 +83,16 @@ class LeaderAcceleration(Effect):
 class BrakeLight(Effect):
     """Reaction to the leader's braking only, ``+ c min(a_lead, 0)``."""
 
-    kind: ClassVar[str] = "brake_light"
-    title: ClassVar[str] = "brake lights"
-    equation: ClassVar[str] = "+ c min(a_lead, 0)"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "brake_light"
+    title = "brake lights"
+    equation = "+ c min(a_lead, 0)"
+    wording = (
         "drivers brake less than {law} while their leader brakes",
         "drivers brake as soon as their leader does, which {law} does not see",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("leader_acceleration", "asymmetry", "second_leader")
-    told_by: ClassVar[str] = (
-        "leaders that accelerate as sharply as they brake tell brake lights from the leader's acceleration"
-    )
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("gain", "c", "1", 0.5, -1.0, 2.0, null=0.0, starts=(0.1,)),)
+    looks_like = ("leader_acceleration", "asymmetry", "second_leader")
+    told_by = "leaders that accelerate as sharply as they brake tell brake lights from the leader's acceleration"
+    declared = (Parameter("gain", "c", "1", 0.5, -1.0, 2.0, null=0.0, starts=(0.1,)),)
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return c min(a_lead, 0) (m/s²)."""
@@ -110,20 +103,18 @@ class BrakeLight(Effect):
 class Follower(Effect):
     """Pressure from behind: ``+ c a min(((s0 + v T)/s_behind)², cap)``; s_behind is the follower's gap (m)."""
 
-    kind: ClassVar[str] = "follower"
-    title: ClassVar[str] = "pressure from behind"
-    equation: ClassVar[str] = "+ c a min(((s0 + v T)/s_behind)², 4)"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "follower"
+    title = "pressure from behind"
+    equation = "+ c a min(((s0 + v T)/s_behind)², 4)"
+    wording = (
         "drivers slow down when a vehicle is close behind, which {law} does not see",
         "drivers speed up when a vehicle is close behind, which {law} does not see",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("time_gap", "max_accel")
-    told_by: ClassVar[str] = "followers that come and go behind one driver tell their pressure from a shorter time gap"
-    beyond: ClassVar[Neighbour] = "vehicle behind"
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("gain", "c", "1", 0.15, -0.5, 1.0, null=0.0, starts=(0.03,)),
-    )
-    needs: ClassVar[frozenset[str]] = frozenset({"behind"})
+    looks_like = ("time_gap", "max_accel")
+    told_by = "followers that come and go behind one driver tell their pressure from a shorter time gap"
+    beyond = "vehicle behind"
+    declared = (Parameter("gain", "c", "1", 0.15, -0.5, 1.0, null=0.0, starts=(0.03,)),)
+    needs = frozenset({"behind"})
     cap: float = 4.0
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
@@ -150,24 +141,24 @@ class Courtesy(Effect):
     only the first wants in (``turns`` of ``mandatory_change``). Whom to let in plays no part in his own wishes.
     """
 
-    kind: ClassVar[str] = "courtesy"
-    sought: ClassVar[Sought] = "never"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["schakel_2012"],)
-    adds: ClassVar[bool] = True  # a weight below 0 keeps others out
-    title: ClassVar[str] = "courtesy"
-    equation: ClassVar[str] = "− w min(b, v / 1 s, a max(0, (s*_m/s_m)² − (s*/s)²))"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "courtesy"
+    sought = "never"
+    sources = (PUBLICATIONS["schakel_2012"],)
+    adds = True  # a weight below 0 keeps others out
+    title = "courtesy"
+    equation = "− w min(b, v / 1 s, a max(0, (s*_m/s_m)² − (s*/s)²))"
+    wording = (
         "drivers close up to keep out whoever signals beside them",
         "drivers let in whoever signals beside them, which {law} does not see",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("second_leader", "lateral", "time_gap")
-    told_by: ClassVar[str] = "gaps that open beside a vehicle that wants in, while one's own leader keeps his speed"
-    beyond: ClassVar[Neighbour] = "vehicle in an adjacent lane"
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    looks_like = ("second_leader", "lateral", "time_gap")
+    told_by = "gaps that open beside a vehicle that wants in, while one's own leader keeps his speed"
+    beyond = "vehicle in an adjacent lane"
+    declared = (
         Parameter("weight", "w", "1", 0.5, -0.5, 1.0, null=0.0, starts=(0.1,)),
         Parameter("zipper", "z", "1", 0.0, 0.0, 1.0, null=0.0, role="shape"),
     )
-    needs: ClassVar[frozenset[str]] = frozenset({"merger"})
+    needs = frozenset({"merger"})
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the braking for the vehicle that signals (m/s²)."""
@@ -206,13 +197,13 @@ class Calm(Effect):
     near 1 drivers let the gap grow slowly again. The ACC model of Kesting, Treiber and Helbing (2010), c = 0.99.
     """
 
-    kind: ClassVar[str] = "calm"
-    sought: ClassVar[Sought] = "never"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["kesting_2010"],)
-    adds: ClassVar[bool] = True
-    title: ClassVar[str] = "calm behind who cuts in"
-    equation: ClassVar[str] = "+ c max(0, a_CAH + b tanh((a_IDM − a_CAH)/b) − a_IDM)"
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("coolness", "c", "1", 0.99, 0.0, 1.0, null=0.0),)
+    kind = "calm"
+    sought = "never"
+    sources = (PUBLICATIONS["kesting_2010"],)
+    adds = True
+    title = "calm behind who cuts in"
+    equation = "+ c max(0, a_CAH + b tanh((a_IDM − a_CAH)/b) − a_IDM)"
+    declared = (Parameter("coolness", "c", "1", 0.99, 0.0, 1.0, null=0.0),)
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return by how much less drivers brake (m/s²)."""
@@ -230,20 +221,18 @@ class Lateral(Effect):
     Input ``lateral``: an ``Adjacent(distance, speed, present)`` for every vehicle. ``reach`` in metres.
     """
 
-    kind: ClassVar[str] = "lateral"
-    takes: ClassVar[type | None] = Adjacent
-    title: ClassVar[str] = "friction with the adjacent lane"
-    equation: ClassVar[str] = "− c max(v − v_adjacent, 0) exp(−|dx| / 25 m)"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "lateral"
+    takes = Adjacent
+    title = "friction with the adjacent lane"
+    equation = "− c max(v − v_adjacent, 0) exp(−|dx| / 25 m)"
+    wording = (
         "drivers speed up beside a slower lane, which {law} does not see",
         "drivers slow down beside a slower lane, which {law} does not see",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("desired_speed", "drag")
-    told_by: ClassVar[str] = "free driving beside empty and beside slow lanes tells friction from a lower desired speed"
-    beyond: ClassVar[Neighbour] = "vehicle in an adjacent lane"
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("gain", "c", "1/s", 0.1, -0.5, 1.0, null=0.0, starts=(0.03,)),
-    )
+    looks_like = ("desired_speed", "drag")
+    told_by = "free driving beside empty and beside slow lanes tells friction from a lower desired speed"
+    beyond = "vehicle in an adjacent lane"
+    declared = (Parameter("gain", "c", "1/s", 0.1, -0.5, 1.0, null=0.0, starts=(0.03,)),)
     reach: float = 25.0
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:

@@ -12,7 +12,7 @@ It begins at its mean, 0, unless ``Simulator.state`` is given a seed, and what a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -27,10 +27,10 @@ from idm_env.types import Driver, Scene
 class Noise(Effect):
     """White acceleration noise ``+ σ ξ``."""
 
-    kind: ClassVar[str] = "noise"
-    sees_truth: ClassVar[bool] = True
-    draws: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("sigma", "σ", "m/s²", 0.1, 0.0, 2.0, null=0.0),)
+    kind = "noise"
+    sees_truth = True
+    draws = True
+    declared = (Parameter("sigma", "σ", "m/s²", 0.1, 0.0, 2.0, null=0.0),)
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return σ ξ (m/s²)."""
@@ -56,19 +56,16 @@ def _level(effect: Effect, scene: Scene, p: P) -> Tensor:
 class AccelNoise(Effect):
     """Drifting acceleration ``+ σ n``: what a driver does beside what the scene asks for, for about τ."""
 
-    kind: ClassVar[str] = "accel_noise"
-    sees_truth: ClassVar[bool] = True
-    draws: ClassVar[bool] = True
-    title: ClassVar[str] = "drifting acceleration"
-    equation: ClassVar[str] = "+ σ n, dn = −n dt/τ + √(2/τ) dW"
-    wording: ClassVar[tuple[str, str]] = ("", "drivers accelerate by something beside the scene that wanders in time")
-    looks_like: ClassVar[tuple[str, ...]] = ("perception_noise", "wander")
-    told_by: ClassVar[str] = "free traffic, where neither a time gap nor a perceived gap matters"
-    acts_on: ClassVar[str] = "acceleration"
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("sigma", "σ", "m/s²", 0.1, 0.0, 2.0, null=0.0),
-        _memory_time(2.0),
-    )
+    kind = "accel_noise"
+    sees_truth = True
+    draws = True
+    title = "drifting acceleration"
+    equation = "+ σ n, dn = −n dt/τ + √(2/τ) dW"
+    wording = ("", "drivers accelerate by something beside the scene that wanders in time")
+    looks_like = ("perception_noise", "wander")
+    told_by = "free traffic, where neither a time gap nor a perceived gap matters"
+    acts_on = "acceleration"
+    declared = (Parameter("sigma", "σ", "m/s²", 0.1, 0.0, 2.0, null=0.0), _memory_time(2.0))
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return n = 0."""
@@ -90,20 +87,17 @@ class Wander(Effect):
     The process is that of errors of perception (Treiber, Kesting, Helbing 2006, Physica A 360), here on a parameter.
     """
 
-    kind: ClassVar[str] = "wander"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2006"],)
-    draws: ClassVar[bool] = True
-    rank: ClassVar[int] = 5
-    title: ClassVar[str] = "wandering style"
-    equation: ClassVar[str] = "T e^(σ n), dn = −n dt/τ + √(2/τ) dW"
-    wording: ClassVar[tuple[str, str]] = ("", "drivers' time gap wanders about its mean")
-    looks_like: ClassVar[tuple[str, ...]] = ("accel_noise", "perception_noise", "time_gap over time")
-    told_by: ClassVar[str] = "the same driver at low and high speed: a time gap acts by the speed, an acceleration not"
-    acts_on: ClassVar[str] = "time_gap"
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("sigma", "σ", "1", 0.2, 0.0, 1.5, null=0.0),
-        _memory_time(20.0),
-    )
+    kind = "wander"
+    sources = (PUBLICATIONS["treiber_2006"],)
+    draws = True
+    rank = 5
+    title = "wandering style"
+    equation = "T e^(σ n), dn = −n dt/τ + √(2/τ) dW"
+    wording = ("", "drivers' time gap wanders about its mean")
+    looks_like = ("accel_noise", "perception_noise", "time_gap over time")
+    told_by = "the same driver at low and high speed: a time gap acts by the speed, an acceleration not"
+    acts_on = "time_gap"
+    declared = (Parameter("sigma", "σ", "1", 0.2, 0.0, 1.5, null=0.0), _memory_time(20.0))
     of: Literal["time_gap", "desired_speed", "min_gap"] = "time_gap"
 
     @property
@@ -133,15 +127,15 @@ class PerceptionNoise(Effect):
     360): two effects here, of independent n, one per ``signal``. Without a leader there is no error.
     """
 
-    kind: ClassVar[str] = "perception_noise"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2006"],)
-    draws: ClassVar[bool] = True
-    title: ClassVar[str] = "drifting errors of perception"
-    equation: ClassVar[str] = "s e^(σ n) or Δv + σ s n, dn = −n dt/τ + √(2/τ) dW"
-    wording: ClassVar[tuple[str, str]] = ("", "drivers misjudge the gap or the closing speed, for a while each time")
-    looks_like: ClassVar[tuple[str, ...]] = ("wander", "accel_noise")
-    told_by: ClassVar[str] = "standstill and slow traffic: a misjudged gap matters there, a wandering time gap does not"
-    acts_on: ClassVar[str] = "gap"
+    kind = "perception_noise"
+    sources = (PUBLICATIONS["treiber_2006"],)
+    draws = True
+    title = "drifting errors of perception"
+    equation = "s e^(σ n) or Δv + σ s n, dn = −n dt/τ + √(2/τ) dW"
+    wording = ("", "drivers misjudge the gap or the closing speed, for a while each time")
+    looks_like = ("wander", "accel_noise")
+    told_by = "standstill and slow traffic: a misjudged gap matters there, a wandering time gap does not"
+    acts_on = "gap"
     signal: Literal["gap", "closing_speed"] = "gap"
 
     @property

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 
-from idm_env.effects.base import Effect, P, Sought
+from idm_env.effects.base import Effect, P
 from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Imagined, Neighbour, Scene
@@ -22,17 +21,17 @@ class Delay(Effect):
     what a platoon of default drivers (T = 1.5 s) can bear; at 1.1 s they collide without any reason ahead.
     """
 
-    kind: ClassVar[str] = "delay"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["treiber_2006"],)
-    rank: ClassVar[int] = -10
-    title: ClassVar[str] = "reaction delay"
-    equation: ClassVar[str] = "all that is seen is taken at t − τ"
-    wording: ClassVar[tuple[str, str]] = ("", "drivers react later than {law}")
-    looks_like: ClassVar[tuple[str, ...]] = ("lag", "leader_acceleration with the other sign")
-    told_by: ClassVar[str] = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells delay from lag"
-    cancels: ClassVar[tuple[str, ...]] = ("leader_acceleration", "second_leader")
-    latency: ClassVar[bool] = True
-    acts_on: ClassVar[str] = "response"
+    kind = "delay"
+    sources = (PUBLICATIONS["treiber_2006"],)
+    rank = -10
+    title = "reaction delay"
+    equation = "all that is seen is taken at t − τ"
+    wording = ("", "drivers react later than {law}")
+    looks_like = ("lag", "leader_acceleration with the other sign")
+    told_by = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells delay from lag"
+    cancels = ("leader_acceleration", "second_leader")
+    latency = True
+    acts_on = "response"
     max_delay: float = 1.0
 
     @property
@@ -59,15 +58,15 @@ class DeadZone(Effect):
     differentiable in θ where θ > 0. At θ = 0 the derivative vanishes: search from the ``starts``.
     """
 
-    kind: ClassVar[str] = "dead_zone"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["wiedemann_1974"],)
-    title: ClassVar[str] = "threshold of looming"
-    equation: ClassVar[str] = "Δv is seen as 0 while 1.8 |Δv| / s² < θ"
-    wording: ClassVar[tuple[str, str]] = ("", "drivers do not notice the small closing speeds that {law} reacts to")
-    looks_like: ClassVar[tuple[str, ...]] = ("comfort_decel", "action_point")
-    told_by: ClassVar[str] = "slow approaches at long gaps tell a threshold from softer braking"
-    acts_on: ClassVar[str] = "closing_speed"
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    kind = "dead_zone"
+    sources = (PUBLICATIONS["wiedemann_1974"],)
+    title = "threshold of looming"
+    equation = "Δv is seen as 0 while 1.8 |Δv| / s² < θ"
+    wording = ("", "drivers do not notice the small closing speeds that {law} reacts to")
+    looks_like = ("comfort_decel", "action_point")
+    told_by = "slow approaches at long gaps tell a threshold from softer braking"
+    acts_on = "closing_speed"
+    declared = (
         Parameter("threshold", "θ", "rad/s", 0.002, 0.0, 0.02, null=0.0, role="threshold", starts=(0.001, 0.004)),
     )
     sharpness: int = 8
@@ -90,22 +89,17 @@ class ClosingGain(Effect):
     its own, as k2 is in linear controllers of production cars (Milanés and Shladover 2014, Transp. Res. C 48, 285).
     """
 
-    kind: ClassVar[str] = "closing_gain"
-    sought: ClassVar[Sought] = "never"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["milanes_2014"],)
-    title: ClassVar[str] = "gain on the closing speed"
-    equation: ClassVar[str] = "Δv is seen as k Δv"
-    wording: ClassVar[tuple[str, str]] = (
-        "drivers answer to closing speeds less than {law}",
-        "drivers answer to closing speeds more than {law}",
-    )
-    looks_like: ClassVar[tuple[str, ...]] = ("comfort_decel",)
-    told_by: ClassVar[str] = "nothing within the bounds of b tells it from the comfortable deceleration"
-    acts_on: ClassVar[str] = "closing_speed"
-    per_driver: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("gain", "k", "1", 0.5, 0.05, 20.0, null=1.0, starts=(0.7, 1.4)),
-    )
+    kind = "closing_gain"
+    sought = "never"
+    sources = (PUBLICATIONS["milanes_2014"],)
+    title = "gain on the closing speed"
+    equation = "Δv is seen as k Δv"
+    wording = ("drivers answer to closing speeds less than {law}", "drivers answer to closing speeds more than {law}")
+    looks_like = ("comfort_decel",)
+    told_by = "nothing within the bounds of b tells it from the comfortable deceleration"
+    acts_on = "closing_speed"
+    per_driver = True
+    declared = (Parameter("gain", "k", "1", 0.5, 0.05, 20.0, null=1.0, starts=(0.7, 1.4)),)
 
     def perceive(self, scene: Scene, p: P) -> Scene:
         """Return the scene in which the leader is as much faster or slower as the driver takes him to be."""
@@ -118,19 +112,19 @@ class ClosingGain(Effect):
 class GapBias(Effect):
     """A gap seen (or measured) as gap + d metres, wherever there is a leader."""
 
-    kind: ClassVar[str] = "gap_bias"
-    title: ClassVar[str] = "bias of the gap"
-    equation: ClassVar[str] = "gap seen = gap + d"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "gap_bias"
+    title = "bias of the gap"
+    equation = "gap seen = gap + d"
+    wording = (
         "drivers act as if the gap were shorter than it is measured",
         "drivers act as if the gap were longer than it is measured",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("min_gap",)
-    told_by: ClassVar[str] = (
+    looks_like = ("min_gap",)
+    told_by = (
         "gaps measured a second way, or standstill behind a leader with known bumpers, tell a bias from the minimum gap"
     )
-    acts_on: ClassVar[str] = "gap"
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("bias", "d", "m", 1.0, -5.0, 5.0, null=0.0, starts=(0.2,)),)
+    acts_on = "gap"
+    declared = (Parameter("bias", "d", "m", 1.0, -5.0, 5.0, null=0.0, starts=(0.2,)),)
 
     def perceive(self, scene: Scene, p: P) -> Scene:
         """Return the scene with the biased gap."""
@@ -145,8 +139,8 @@ class ImaginedLeader(Effect):
     Input ``imagined``: an ``Imagined(gap, closing_speed)``. There is always a leader then, be it imagined.
     """
 
-    kind: ClassVar[str] = "imagined"
-    takes: ClassVar[type | None] = Imagined
+    kind = "imagined"
+    takes = Imagined
 
     def perceive(self, scene: Scene, p: P) -> Scene:
         """Return the scene with the imagined leader."""

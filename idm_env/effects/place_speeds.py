@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from idm_env.effects.base import Effect, P, Sought
+from idm_env.effects.base import Effect, P
 from idm_env.effects.places import along, curve, rising
 from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
@@ -23,20 +22,18 @@ class SpeedProfile(Effect):
     metres where given.
     """
 
-    kind: ClassVar[str] = "speed_profile"
-    title: ClassVar[str] = "desired speed by place"
-    equation: ClassVar[str] = "v0 → v0 (1 + c(x))"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "speed_profile"
+    title = "desired speed by place"
+    equation = "v0 → v0 (1 + c(x))"
+    wording = (
         "drivers want to go slower at some places of the road, where {law} has one desired speed",
         "drivers want to go faster at some places of the road than at others, where {law} has one desired speed",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("speed_zone", "grade", "time_gap over position")
-    told_by: ClassVar[str] = (
-        "the same place at low and high speed: a slope acts always, a desired speed on those near it"
-    )
-    sought: ClassVar[Sought] = "profile"
-    acts_on: ClassVar[str] = "desired_speed"
-    rank: ClassVar[int] = 1
+    looks_like = ("speed_zone", "grade", "time_gap over position")
+    told_by = "the same place at low and high speed: a slope acts always, a desired speed on those near it"
+    sought = "profile"
+    acts_on = "desired_speed"
+    rank = 1
     knots: tuple[float, ...] = (0.0, 250.0, 500.0, 750.0, 1000.0)
     period: float | None = None
 
@@ -72,21 +69,21 @@ class CurveSpeed(Effect):
     43(3), 483). Absent at its null, a lateral acceleration that no tyre holds.
     """
 
-    kind: ClassVar[str] = "curve_speed"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["reymond_2001"],)
-    title: ClassVar[str] = "speed in bends"
-    equation: ClassVar[str] = "v0 → min(v0, √(a_lat / |κ(x)|))"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "curve_speed"
+    sources = (PUBLICATIONS["reymond_2001"],)
+    title = "speed in bends"
+    equation = "v0 → min(v0, √(a_lat / |κ(x)|))"
+    wording = (
         "drivers go through bends no faster than a lateral acceleration allows, where {law} has one desired speed",
         "",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("speed_profile", "speed_zone", "grade")
-    told_by: ClassVar[str] = "bends of several radii: one lateral acceleration fits all of them, a zone each its own"
-    sought: ClassVar[Sought] = "given"
-    column: ClassVar[str] = "curvature"
-    acts_on: ClassVar[str] = "desired_speed"
-    rank: ClassVar[int] = 1
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    looks_like = ("speed_profile", "speed_zone", "grade")
+    told_by = "bends of several radii: one lateral acceleration fits all of them, a zone each its own"
+    sought = "given"
+    column = "curvature"
+    acts_on = "desired_speed"
+    rank = 1
+    declared = (
         Parameter(
             "lateral_accel", "a_lat", "m/s²", 2.5, 0.2, 15.0, null=1e6, role="threshold", starts=(1.5, 3.0, 5.0),
         ),

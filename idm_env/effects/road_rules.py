@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -56,15 +55,13 @@ class SpeedLimit(Effect):
     ValueError for a limit of 0 or below, or a zone that ends before it begins.
     """
 
-    kind: ClassVar[str] = "speed_limit"
-    needs: ClassVar[frozenset[str]] = frozenset({"lane"})
-    acts_on: ClassVar[str] = "desired_speed"
-    title: ClassVar[str] = "speed limits"
-    equation: ClassVar[str] = "v0 → v0 + c (min(v0, v_lim) − v0)"
-    rank: ClassVar[int] = 2
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("compliance", "c", "1", 1.0, 0.0, 1.0, null=0.0, role="shape"),
-    )
+    kind = "speed_limit"
+    needs = frozenset({"lane"})
+    acts_on = "desired_speed"
+    title = "speed limits"
+    equation = "v0 → v0 + c (min(v0, v_lim) − v0)"
+    rank = 2
+    declared = (Parameter("compliance", "c", "1", 1.0, 0.0, 1.0, null=0.0, role="shape"),)
     zones: tuple[tuple[float, ...], ...] = ((-1.0, 100.0, 1000.0, 8.0),)
 
     def __post_init__(self) -> None:
@@ -91,10 +88,10 @@ class LaneClosure(Effect):
     rows it is absent.
     """
 
-    kind: ClassVar[str] = "lane_closure"
-    needs: ClassVar[frozenset[str]] = frozenset({"lane"})
-    adds: ClassVar[bool] = False
-    title: ClassVar[str] = "closed lanes"
+    kind = "lane_closure"
+    needs = frozenset({"lane"})
+    adds = False
+    title = "closed lanes"
     closures: tuple[tuple[float, ...], ...] = ((0.0, 400.0, 600.0, 0.0, 600.0),)
 
     def __post_init__(self) -> None:
@@ -141,11 +138,11 @@ class Signal(Effect):
     ρ, his reaction, however late he brakes: that is his memory, 1 or 0. Absent at r = 0.
     """
 
-    kind: ClassVar[str] = "signal"
-    adds: ClassVar[bool] = False
-    title: ClassVar[str] = "signal"
-    equation: ClassVar[str] = "red where (t − φ) mod C ≥ C − r"
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    kind = "signal"
+    adds = False
+    title = "signal"
+    equation = "red where (t − φ) mod C ≥ C − r"
+    declared = (
         Parameter("place", "x_s", "m", 400.0, -1e6, 1e6, role="place"),
         Parameter("cycle", "C", "s", 60.0, 1.0, 3600.0, role="shape"),
         Parameter("red", "r", "s", 30.0, 0.0, 3600.0, null=0.0, role="threshold", most="cycle"),
@@ -196,10 +193,10 @@ class Destination(Effect):
     Arem 2012). Absent where the place is behind everybody.
     """
 
-    kind: ClassVar[str] = "destination"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["schakel_2012"],)
-    needs: ClassVar[frozenset[str]] = frozenset({"lane"})
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    kind = "destination"
+    sources = (PUBLICATIONS["schakel_2012"],)
+    needs = frozenset({"lane"})
+    declared = (
         Parameter("first", "k_1", "1", 0.0, 0.0, 1000.0, role="shape"),
         Parameter("last", "k_2", "1", 1000.0, 0.0, 1000.0, role="shape"),
         Parameter("place", "x_d", "m", 1000.0, -1e9, 1e6, null=-1e9, role="place"),

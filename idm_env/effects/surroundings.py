@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from idm_env.effects.base import Effect, P, Sought
+from idm_env.effects.base import Effect, P
 from idm_env.effects.places import along, curve, rising
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
@@ -26,20 +25,18 @@ class Grade(Effect):
     the profile is found from the traffic. ``knots`` are positions (m), on a lap of ``period`` metres where given.
     """
 
-    kind: ClassVar[str] = "grade"
-    title: ClassVar[str] = "slope of the road"
-    equation: ClassVar[str] = "− g sin(arctan(slope(x)))"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "grade"
+    title = "slope of the road"
+    equation = "− g sin(arctan(slope(x)))"
+    wording = (
         "vehicles go faster uphill and slower downhill, which {law} does not know",
         "vehicles are held back uphill and pushed on downhill, which {law} does not know",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("speed_zone", "time_gap over position")
-    told_by: ClassVar[str] = (
-        "the same place at low and high speed, with and without leader, tells a grade from a speed zone"
-    )
-    sought: ClassVar[Sought] = "profile"
-    column: ClassVar[str] = "grade"
-    sees_truth: ClassVar[bool] = True
+    looks_like = ("speed_zone", "time_gap over position")
+    told_by = "the same place at low and high speed, with and without leader, tells a grade from a speed zone"
+    sought = "profile"
+    column = "grade"
+    sees_truth = True
     knots: tuple[float, ...] = (0.0, 250.0, 500.0, 750.0, 1000.0)
     profile: tuple[float, ...] | None = None
     period: float | None = None
@@ -72,19 +69,17 @@ class Grade(Effect):
 class Drag(Effect):
     """Air drag ``− c v²`` beyond what the driver compensates; c = ρ c_w A / (2 m), 2e-4 to 8e-4 1/m for cars."""
 
-    kind: ClassVar[str] = "drag"
-    title: ClassVar[str] = "drag"
-    equation: ClassVar[str] = "− c v²"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "drag"
+    title = "drag"
+    equation = "− c v²"
+    wording = (
         "vehicles are pushed on by the square of their speed, beyond {law}",
         "vehicles are held back by the square of their speed, beyond {law}",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("speed_dependent_gap", "power_limit", "desired_speed")
-    told_by: ClassVar[str] = "free starts from standstill to above 25 m/s tell drag from v0 and power"
-    sees_truth: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("coefficient", "c", "1/m", 4e-4, -2e-3, 5e-3, null=0.0, starts=(1e-4,)),
-    )
+    looks_like = ("speed_dependent_gap", "power_limit", "desired_speed")
+    told_by = "free starts from standstill to above 25 m/s tell drag from v0 and power"
+    sees_truth = True
+    declared = (Parameter("coefficient", "c", "1/m", 4e-4, -2e-3, 5e-3, null=0.0, starts=(1e-4,)),)
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the drag (m/s²)."""

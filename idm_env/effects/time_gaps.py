@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -23,21 +22,19 @@ class SpeedTimeGap(Effect):
     Intell. Transp. Syst. 6, 229). ``reference`` in m/s.
     """
 
-    kind: ClassVar[str] = "speed_time_gap"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["zhou_2005"],)
-    rank: ClassVar[int] = 2
-    title: ClassVar[str] = "speed-dependent time gap"
-    equation: ClassVar[str] = "T → T (1 + k (v / (20 m/s) − 1))"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "speed_time_gap"
+    sources = (PUBLICATIONS["zhou_2005"],)
+    rank = 2
+    title = "speed-dependent time gap"
+    equation = "T → T (1 + k (v / (20 m/s) − 1))"
+    wording = (
         "drivers keep shorter time gaps the faster they go, where {law} keeps one",
         "drivers keep longer time gaps the faster they go, where {law} keeps one",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("speed_dependent_gap", "drag", "min_gap and time_gap together")
-    told_by: ClassVar[str] = "following at 5 to 35 m/s by one driver tells a line over speed from a root and from drag"
-    acts_on: ClassVar[str] = "time_gap"
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("slope", "k", "1", -0.3, -0.95, 2.0, null=0.0, starts=(0.1,)),
-    )
+    looks_like = ("speed_dependent_gap", "drag", "min_gap and time_gap together")
+    told_by = "following at 5 to 35 m/s by one driver tells a line over speed from a root and from drag"
+    acts_on = "time_gap"
+    declared = (Parameter("slope", "k", "1", -0.3, -0.95, 2.0, null=0.0, starts=(0.1,)),)
     reference: float = 20.0
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
@@ -55,24 +52,22 @@ class SetPointAsymmetry(Effect):
     braking traffic (Newell 1965 for traffic; Yeo and Skabardonis 2009 in measured platoons).
     """
 
-    kind: ClassVar[str] = "set_point_asymmetry"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["newell_1965"], PUBLICATIONS["yeo_2009"])
-    rank: ClassVar[int] = 2
-    title: ClassVar[str] = "asymmetric time gap"
-    equation: ClassVar[str] = "T → T (1 + k a_lead / √(a_lead² + 0.09 m²/s⁴))"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "set_point_asymmetry"
+    sources = (PUBLICATIONS["newell_1965"], PUBLICATIONS["yeo_2009"])
+    rank = 2
+    title = "asymmetric time gap"
+    equation = "T → T (1 + k a_lead / √(a_lead² + 0.09 m²/s⁴))"
+    wording = (
         "drivers keep shorter time gaps behind accelerating leaders than behind braking ones, where {law} keeps one",
         "drivers keep longer time gaps behind accelerating leaders than behind braking ones, where {law} keeps one",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("leader_acceleration", "asymmetry", "brake_light")
-    told_by: ClassVar[str] = (
+    looks_like = ("leader_acceleration", "asymmetry", "brake_light")
+    told_by = (
         "leaders that accelerate or brake gently for 10 s and longer tell a time gap, which saturates and lasts, from "
         "answers to the acceleration"
     )
-    acts_on: ClassVar[str] = "time_gap"
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("strength", "k", "1", 0.15, -0.8, 0.8, null=0.0, starts=(0.05,)),
-    )
+    acts_on = "time_gap"
+    declared = (Parameter("strength", "k", "1", 0.15, -0.8, 0.8, null=0.0, starts=(0.05,)),)
     width: float = 0.3
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
@@ -96,20 +91,20 @@ class Relaxation(Effect):
     that Laval and Leclercq (2008, Transp. Res. B 42, 511) put after lane changes, here for whatever brought it about.
     """
 
-    kind: ClassVar[str] = "relaxation"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["laval_2008"],)
-    rank: ClassVar[int] = 2
-    title: ClassVar[str] = "relaxation of the time gap"
-    equation: ClassVar[str] = "T → T (1 + β (m − 1)), τ dm/dt = s √(1 − (v/v0)⁴) / (s0 + v T) − m"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "relaxation"
+    sources = (PUBLICATIONS["laval_2008"],)
+    rank = 2
+    title = "relaxation of the time gap"
+    equation = "T → T (1 + β (m − 1)), τ dm/dt = s √(1 − (v/v0)⁴) / (s0 + v T) − m"
+    wording = (
         "",
         "drivers accept the time gap that they have had for a while and return to their own slowly, where {law} goes "
         "back to it at once",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("memory", "regime_shift", "max_accel")
-    told_by: ClassVar[str] = "gaps that a cut-in or a hard brake left far from the usual one, followed for a minute"
-    acts_on: ClassVar[str] = "time_gap"
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    looks_like = ("memory", "regime_shift", "max_accel")
+    told_by = "gaps that a cut-in or a hard brake left far from the usual one, followed for a minute"
+    acts_on = "time_gap"
+    declared = (
         Parameter("strength", "β", "1", 0.5, 0.0, 0.95, null=0.0, starts=(0.3,)),
         Parameter("memory_time", "τ", "s", 15.0, 2.0, 200.0, role="shape", starts=(8.0, 30.0)),
     )
@@ -151,25 +146,25 @@ class LeaderTrend(Effect):
     acceleration, braking and coasting keep different time gaps (Zhang and Kim 2005, Transp. Res. B 39, 385).
     """
 
-    kind: ClassVar[str] = "leader_trend"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["zhang_2005"], PUBLICATIONS["yeo_2009"])
-    rank: ClassVar[int] = 2
-    title: ClassVar[str] = "time gap by the leader's trend"
-    equation: ClassVar[str] = "T → T κ^x, x = (v_lead − m) / (3 m/s), τ dm/dt = v_lead − m"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "leader_trend"
+    sources = (PUBLICATIONS["zhang_2005"], PUBLICATIONS["yeo_2009"])
+    rank = 2
+    title = "time gap by the leader's trend"
+    equation = "T → T κ^x, x = (v_lead − m) / (3 m/s), τ dm/dt = v_lead − m"
+    wording = (
         "drivers keep shorter time gaps behind a leader who has become faster than behind one who has become slower, "
         "where {law} keeps one",
         "drivers keep longer time gaps behind a leader who has become faster than behind one who has become slower, "
         "where {law} keeps one",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("set_point_asymmetry", "leader_acceleration", "relaxation")
-    told_by: ClassVar[str] = (
+    looks_like = ("set_point_asymmetry", "leader_acceleration", "relaxation")
+    told_by = (
         "leaders that change their speed within 5 s and then hold it for half a minute tell a time gap that comes back "
         "from answers to the acceleration, which end with it"
     )
-    acts_on: ClassVar[str] = "time_gap"
-    per_driver: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (
+    acts_on = "time_gap"
+    per_driver = True
+    declared = (
         Parameter("factor", "κ", "1", 0.8, 0.2, 5.0, null=1.0, starts=(0.9,)),
         Parameter("memory_time", "τ", "s", 5.0, 0.5, 60.0, role="shape", starts=(3.0, 10.0)),
     )
@@ -204,22 +199,20 @@ class GapStiffness(Effect):
     Shladover 2014, Transp. Res. C 48, 285).
     """
 
-    kind: ClassVar[str] = "gap_stiffness"
-    sources: ClassVar[tuple[str, ...]] = (PUBLICATIONS["milanes_2014"],)
-    rank: ClassVar[int] = 3
-    title: ClassVar[str] = "stiffness of the pull to one's own gap"
-    equation: ClassVar[str] = "s* → s* (s/s_e)^(1 − w), s_e = (s0 + v T)/√(1 − (v/v0)⁴)"
-    wording: ClassVar[tuple[str, str]] = (
+    kind = "gap_stiffness"
+    sources = (PUBLICATIONS["milanes_2014"],)
+    rank = 3
+    title = "stiffness of the pull to one's own gap"
+    equation = "s* → s* (s/s_e)^(1 − w), s_e = (s0 + v T)/√(1 − (v/v0)⁴)"
+    wording = (
         "drivers pull back to their own gap less hard than {law}",
         "drivers pull back to their own gap harder than {law}",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("relaxation", "max_accel", "comfort_decel")
-    told_by: ClassVar[str] = "gaps far from the usual one at steady speeds, closing and opening, tell it from a and b"
-    acts_on: ClassVar[str] = "time_gap"
-    per_driver: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("stiffness", "w", "1", 0.5, 0.05, 4.0, null=1.0, starts=(0.7, 1.4)),
-    )
+    looks_like = ("relaxation", "max_accel", "comfort_decel")
+    told_by = "gaps far from the usual one at steady speeds, closing and opening, tell it from a and b"
+    acts_on = "time_gap"
+    per_driver = True
+    declared = (Parameter("stiffness", "w", "1", 0.5, 0.05, 4.0, null=1.0, starts=(0.7, 1.4)),)
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver whose desired gap has moved towards the gap that he has."""
