@@ -200,7 +200,7 @@ def oracle(found: Any, truth: Any) -> float | None:
         model = model.adding(term)
     fold = crossed.folds_of(found.records.runs, (), 0)
     each = np.tile(values, (1 + int(fold.max()), 1))
-    return float(crossed.crossed(found.records, model, each, fold, found.problem.noise).summary()["gap_rmse_m"])
+    return float(crossed.crossed(found.records, model, each, fold).summary()["gap_rmse_m"])
 
 
 def measure(job: Job, on_progress: object = None) -> dict[str, Any]:

@@ -144,14 +144,15 @@ def discovery() -> dict[str, Any]:
     steps in one copy more than there are parameters, the drivers' five included, at the candidate's first start.
     """
     from idm_env.data import synthetic
-    from idm_env.discovery import discover, model, records, search
+    from idm_env.discovery import discover, model, records
     from idm_env.discovery.calibrate import first_prior
     from idm_env.discovery.discover import prepare
+    from idm_env.discovery.noise import first_noise
     from idm_env.discovery.solve import Problem, linearise
 
     trajectories, _ = synthetic.generate(0)
     rows = records.windows(prepare(trajectories, "driver"))
-    problem = Problem(rows, search.first_noise(rows), first_prior())
+    problem = Problem(rows, first_noise(rows), first_prior())
     theta = np.tile(problem.prior.centre, (problem.groups, 1))
 
     def jacobian(name: str) -> Case:

@@ -50,10 +50,14 @@ class Comparison:
 
     @property
     def outcome(self) -> ErrorChange:
-        """``worse`` where an interval lies above 1, of the pooled errors or of the followers' ratios; so ``better``."""
+        """``worse`` where an interval lies above 1, of the pooled errors or of the followers' ratios.
+
+        ``better`` where one lies below, and the pooled error does not rise.
+        """
         if self.low > 1.0 or self.driver[1] > 1.0:
             return ErrorChange.WORSE
-        return ErrorChange.BETTER if self.high < 1.0 or self.driver[2] < 1.0 else ErrorChange.SAME
+        below = self.ratio < 1.0 and (self.high < 1.0 or self.driver[2] < 1.0)
+        return ErrorChange.BETTER if below else ErrorChange.SAME
 
     @property
     def most_worse(self) -> bool:

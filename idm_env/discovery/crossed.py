@@ -15,7 +15,7 @@ from idm_env.discovery import closed_loop, judge
 from idm_env.discovery.calibrate import first_prior, population
 from idm_env.discovery.closed_loop import GRID_S, further
 from idm_env.discovery.model import Hypothesis
-from idm_env.discovery.noise import Noise
+from idm_env.discovery.noise import estimate, first_noise
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
 from idm_env.discovery.score import without
 from idm_env.discovery.solve import Population, Problem, Solution, solve
@@ -25,8 +25,6 @@ POOLED_S = closed_loop.ENDS_S[1]
 """Weight (s) of the population at which every driver is its middle."""
 FURTHER_S = 10.0
 """The longer horizon of predictions, whose windows must lie in a block that drivers were not fitted to."""
-CLEARLY = 1.1
-"""Ratio of errors beyond which whitened predictions do not serve: on short records they do not tell a set-point."""
 EMPTY = np.zeros(0)
 
 
@@ -69,27 +67,25 @@ def _loss(left: np.ndarray) -> float:
 
 
 def crossed(
-    records: Records, model: Hypothesis, values: np.ndarray, fold: np.ndarray, noise: Noise,
-    start: np.ndarray | None = None, pooled: bool = False, whitened: bool | None = None,
+    records: Records, model: Hypothesis, values: np.ndarray, fold: np.ndarray, start: np.ndarray | None = None,
+    pooled: bool = False,
 ) -> judge.Judged:  # fmt: skip
     """Return a model's errors on all runs, each judged by what the other folds say.
 
     A driver's parameters are fitted to every second block of his time and judged between, then the other way round;
     their population and φ come from other folds. Every error has the calibration that serves it: closed-loop
     simulation that of closed-loop simulation, with the weight of the population that other folds choose; predictions
-    5 s ahead the same, or that of whitened predictions 5 s ahead, whose likelihood weighs the population by itself.
+    5 s ahead the same, or that of whitened predictions 5 s ahead, whose likelihood weighs the population by itself:
+    whichever leaves less, whitened by the noise of the model's own errors. So a model's errors are its own, whatever
+    it is compared with.
 
     Args:
         records: All runs.
         model: What is judged.
         values: φ [folds, Q] without the runs of each fold.
         fold: Fold of every run.
-        noise: Of predictions 5 s ahead, the same for all models that are compared.
         start: log θ [G, P] of the model as it is calibrated on all of their time, if it is.
         pooled: Whether every driver is the population's middle.
-        whitened: Which calibration serves predictions 5 s ahead, the same for all models that are compared. None, for
-            the null, takes that of whitened ones, against which drivers' noise weighs least, if it leaves not
-            ``CLEARLY`` more.
     """
     rows, own = whole(records), model.catalogue.own
     is_calibrated = start is not None
@@ -115,18 +111,20 @@ def crossed(
         else:
             parts[int(k)] = _weighed(mine, prior, frozen, near)
     gap, speed, thetas = _simulated(rows, second, fold, parts)
-    short = windows(records)
-    problem = Problem(short, noise.unweighted(len(short)), first_prior(own))
+    short, longer = windows(records), in_blocks(records)
+    problem = Problem(short, None, first_prior(own))
     ahead = _predicted(problem, model, values, fold, thetas)
-    if whitened is not False and not pooled:
-        others = _whitened(problem, model, values, fold, theta)
+    if not pooled:
+        whitened = replace(problem, noise=first_noise(short))
+        noise = estimate(_predicted(whitened, model, values, fold, thetas), short.joined)
+        others = _whitened(replace(problem, noise=noise.unweighted(len(short))), model, values, fold, theta)
         other = _predicted(problem, model, values, fold, others)
-        left = [_loss(np.bincount(short.group, x**2)[np.unique(short.group)]) ** 0.25 for x in (ahead, other)]
-        whitened = bool(whitened or left[1] < CLEARLY * left[0])
-        ahead, thetas = (other, others) if whitened else (ahead, thetas)
-    longer = in_blocks(records)
-    further = EMPTY if longer is None else _predicted(Problem(longer, None, problem.prior), model, values, fold, thetas)
-    return judge.Judged(rows, gap, speed, ahead, short.record, bool(whitened), further)
+        left = [_loss(np.bincount(short.group, x[:, -1] ** 2)[np.unique(short.group)]) for x in (ahead, other)]
+        ahead, thetas = (other, others) if left[1] < left[0] else (ahead, thetas)
+    further = EMPTY
+    if longer is not None:
+        further = _predicted(replace(problem, rows=longer), model, values, fold, thetas)[:, -1]
+    return judge.Judged(rows, gap, speed, ahead[:, -1], short.record, further)
 
 
 def in_blocks(records: Records) -> Rows | None:
@@ -217,12 +215,12 @@ def _whitened(
 def _predicted(
     problem: Problem, model: Hypothesis, values: np.ndarray, fold: np.ndarray, thetas: dict[int, np.ndarray]
 ) -> np.ndarray:
-    """Return errors of the gap 5 s ahead [windows] with log θ [2, G, P] of every fold, from the half not scored."""
-    rows, ahead = problem.rows, np.zeros(len(problem.rows))
-    copy = (rows.block % 2 == 0).astype(int)
+    """Return errors of predictions [windows, m] with log θ [2, G, P] of every fold, from the half not scored."""
+    rows, copy = problem.rows, (problem.rows.block % 2 == 0).astype(int)
+    errors, order = [], []
     for k, theta in thetas.items():
-        mine = fold[rows.run] == k
-        if mine.any():
-            both = Problem(rows.some(mine), None, problem.prior).errors(theta, model.fixed(values[k]), np.zeros((2, 0)))
-            ahead[mine] = np.take_along_axis(both[..., -1], copy[mine][None], 0)[0]
-    return ahead
+        mine = np.flatnonzero(fold[rows.run] == k)
+        both = replace(problem, rows=rows.some(mine)).errors(theta, model.fixed(values[k]), np.zeros((2, 0)))
+        errors.append(both[copy[mine], np.arange(len(mine))])
+        order.append(mine)
+    return np.concatenate(errors)[np.argsort(np.concatenate(order))]

@@ -13,8 +13,9 @@ import numpy as np
 
 from idm_env.data import Trajectories, episodes
 from idm_env.data.recorders import on_one_clock
-from idm_env.discovery import calibrate, judge, march, model as terms, records, search
+from idm_env.discovery import calibrate, judge, march, model as terms, noise, records, search
 from idm_env.discovery.finish import Discovery, finished
+from idm_env.discovery.judge import Judged
 from idm_env.discovery.judgement import Evaluation
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records
@@ -97,11 +98,11 @@ def discover(
     test = prepared.of_runs(test_runs) if test_runs else None
     stores = []
 
-    def searched(bare: Hypothesis, part: str, whitened: bool | None = None) -> tuple[Evaluation, Decided]:
-        """Return what is found beyond a model, which is calibrated and judged as the null."""
+    def searched(bare: Hypothesis, part: str, errors: Judged | None = None) -> tuple[Evaluation, Decided]:
+        """Return what is found beyond a model, which is calibrated and judged as the null: ``errors``, where it is."""
         mark = storage.fingerprint(prepared.groups, prepared.runs, (*options, part), prepared.signals)
         stores.append(storage.Store(None if out is None else out / storage.UNFINISHED / part, mark, resume))
-        problem = Problem(rows, search.first_noise(rows), calibrate.first_prior(bare.catalogue.own))
+        problem = Problem(rows, noise.first_noise(rows), calibrate.first_prior(bare.catalogue.own))
         others = [name for name in names if name not in bare.catalogue.personal]
         searching = Search(problem, others, located and effects is None, stores[-1], progress, bare)
         progress("null", 0, 0, bare.catalogue.base.title)
@@ -109,7 +110,7 @@ def discover(
         null = searching.null(bare, judge.unweighed(rows.records, bare, values, problem.prior)[1], values)
         decided = decide(searching, null, seed)
         progress("final check", 0, 0, "test set")
-        return Evaluation(searching, decided.null, prepared, test, by == "driver", seed, whitened), decided
+        return Evaluation(searching, decided.null, prepared, test, by == "driver", seed, errors), decided
 
     def on_law(*state: Any) -> None:
         progress("other laws", *state)

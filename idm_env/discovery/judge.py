@@ -37,8 +37,6 @@ class Judged:
     speed: np.ndarray
     ahead: np.ndarray
     ahead_record: np.ndarray
-    whitened: bool = False
-    """Whether predictions 5 s ahead have drivers calibrated on whitened predictions, and not on the simulation."""
     further: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Errors of the gap 10 s ahead [windows of 10 s] with the drivers of those 5 s ahead; empty on short blocks."""
 

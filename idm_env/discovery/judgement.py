@@ -171,8 +171,8 @@ class Evaluation:
     test: Records | None
     adapt: bool
     seed: int
-    whitened: bool | None = None
-    """Which calibration predictions 5 s ahead have, where another model has said so (see ``crossed.crossed``)."""
+    known: judge.Judged | None = None
+    """Errors of the model that is completed, where it was judged before; the null may have a latency more."""
 
     @cached_property
     def _fold(self) -> np.ndarray:
@@ -180,8 +180,10 @@ class Evaluation:
 
     @cached_property
     def of_null(self) -> Calibration:
-        """Calibration of the null, which says how predictions 5 s ahead of every other model are calibrated."""
-        return self._judged(self.null, self.searching.problem, self.whitened)
+        """Calibration of the null, with errors that are ``known`` already."""
+        if self.known is None or self.null.model.terms != self.searching.base.terms:
+            return self.judged(self.null)
+        return self.calibrated(self.null.model, self.null.values, self.null.theta)[0], self.known
 
     @cached_property
     def _null_at_best(self) -> judge.Judged:
@@ -193,32 +195,16 @@ class Evaluation:
         test = None if self.adapt else self.test
         return calibrate.judged(fit, self.searching.problem.rows.records, test, self.records, self.adapt)
 
-    def _judged(self, s: Solution, problem: Problem, whitened: bool | None, pooled: bool = False) -> Calibration:
-        theta, errors = self.calibrated(s.model, s.values, s.theta)
-        if self.adapt and self.test is not None:
-            values = crossed.values_of(problem, s, self.records.runs, self._fold)
-            errors = self._crossed(s.model, values, theta.theta, whitened, pooled)
-        return theta, errors
-
-    def _crossed(
-        self,
-        model: Hypothesis,
-        values: np.ndarray,
-        theta: np.ndarray | None,
-        whitened: bool | None,
-        pooled: bool = False,
-    ) -> judge.Judged:
-        noise = self.searching.problem.noise
-        assert noise is not None
-        return crossed.crossed(self.records, model, values, self._fold, noise, theta, pooled, whitened)
-
     def judged(self, s: Solution, problem: Problem | None = None, pooled: bool = False) -> Calibration:
         """Return the calibration of a model; ``problem`` is what φ was fitted to, if not predictions in windows.
 
         With ``pooled`` all drivers have one set of parameters.
         """
-        before = self.of_null[1]
-        return self._judged(s, problem or self.searching.problem, None if before is None else before.whitened, pooled)
+        theta, errors = self.calibrated(s.model, s.values, s.theta)
+        if self.adapt and self.test is not None:
+            values = crossed.values_of(problem or self.searching.problem, s, self.records.runs, self._fold)
+            errors = crossed.crossed(self.records, s.model, values, self._fold, theta.theta, pooled)
+        return theta, errors
 
     def against_null(self, model: Hypothesis) -> tuple[judge.Judged, judge.Judged]:
         """Return the errors of another law, and those of the null that they are compared with (see ``bases``).
@@ -238,15 +224,14 @@ class Evaluation:
             if bases.is_far(at_best, of_null) and not is_worth(at_best, of_null):
                 return at_best, of_null
         values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
-        return self._crossed(model, values, theta, before.whitened), before
+        return crossed.crossed(self.records, model, values, self._fold, theta), before
 
     def among(self, model: Hypothesis, wanted: np.ndarray) -> judge.Judged:
         """Return the errors of a law for the drivers of the records ``wanted`` [records], its population."""
-        records, noise, before = self.records.some(wanted), self.searching.problem.noise, self.of_null[1]
-        assert noise is not None and before is not None
+        records = self.records.some(wanted)
         fold = self._fold[[self.records.runs.index(run) for run in records.runs]]
         values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
-        return crossed.crossed(records, model, values, fold, noise, whitened=before.whitened)
+        return crossed.crossed(records, model, values, fold)
 
     def calibrated_among(self, model: Hypothesis, wanted: np.ndarray) -> Solution:
         """Return the parameters by a law of the drivers of records ``wanted`` [records], its population."""

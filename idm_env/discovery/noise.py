@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from idm_env.discovery.records import Rows
+
 SHRINK = 0.02
 HEAVY = 3.0
 """A window whose whitened error exceeds this many times the usual is weighed down, for all models alike."""
@@ -50,6 +52,13 @@ class Noise:
     def unweighted(self, rows: int) -> Noise:
         """Return the same noise for so many other rows, of which none is weighed down."""
         return replace(self, weight=np.ones(rows))
+
+
+def first_noise(rows: Rows) -> Noise:
+    """Return independent errors of 0.15 m/s and 0.3 m, to begin with."""
+    size = rows.valid.shape[1] + 2
+    white = np.diag(1.0 / np.append(np.full(size - 2, 0.15), [0.2, 0.4]))
+    return Noise(np.zeros((size, size)), white, white, np.ones(len(rows)), 0.0)
 
 
 def estimate(errors: np.ndarray, joined: np.ndarray, rounds: int = 3) -> Noise:

@@ -13,7 +13,6 @@ from idm_env.discovery import calibrate, judge, model as terms, noise as noises,
 from idm_env.discovery.calibrate import Calibrated, population
 from idm_env.discovery.closed_loop import ClosedLoopFit
 from idm_env.discovery.model import Hypothesis, Term
-from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out, log_gain
 from idm_env.discovery.solve import Linear, Problem, Solution, finish, linearise, projected, solve
 from idm_env.discovery.units import Units, units
@@ -376,11 +375,3 @@ def _knots(values: np.ndarray, distance: float, most: int, period: float = 0.0) 
 def starting_values(model: Hypothesis) -> np.ndarray:
     """Return φ [Q] to begin with: the first start of every term."""
     return np.concatenate([np.zeros(0), *(np.array(t.starts[0]) for t in model.terms)])
-
-
-def first_noise(rows: Rows) -> noises.Noise:
-    """Return independent errors of 0.15 m/s and 0.3 m, to begin with."""
-    size = rows.valid.shape[1] + 2
-    sigma = np.append(np.full(size - 2, 0.15), [0.2, 0.4])
-    white = np.diag(1.0 / sigma)
-    return noises.Noise(np.zeros((size, size)), white, white, np.ones(len(rows)), 0.0)

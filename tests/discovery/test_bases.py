@@ -16,6 +16,7 @@ from idm_env.data import synthetic
 from idm_env.discovery import bases, discover, page, write_report
 from idm_env.discovery.bases import is_far
 from idm_env.discovery.calibrate import first_prior
+from idm_env.discovery.compare import ERRORS
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
@@ -58,6 +59,29 @@ def errors(gap: float, ahead: float) -> Judged:
     return cast(Judged, SimpleNamespace(summary=partial(dict, gap_rmse_m=gap, horizon_rmse_m=ahead)))
 
 
+def assert_a_model_has_one_figure(report: dict[str, Any]) -> None:
+    """Every error of a model is one number, in whichever table it stands; what is fitted to it is of another kind."""
+    own, *others = report["models"].values()
+    null = report["models"].get("model_law.yaml") or report["models"].get("model_idm.yaml") or own
+    told: dict[tuple[str, str], set[float]] = {}
+
+    def tell(title: str, errors: dict[str, float]) -> None:
+        for key in ERRORS:
+            if key in errors:
+                told.setdefault((title, key), set()).add(round(errors[key], 9))
+
+    for row in report["bases"]:
+        tell("fitted " * row["fitted_to_what_is_judged"] + row["title"], row)
+    with_what = next((title for title in (own, *others) if title.startswith(f"{null} with ")), "")
+    for title, side in ((null, "before"), (with_what, "after")):
+        tell(title, report["error"][side])
+        tell(title, {key: change[side] for key, change in report["helps"].items()})
+    rungs, free = (list(report["ladder"][name].values()) for name in ("rungs_m", "free_m"))
+    for title, place in ((null, 1), (with_what, 2)):
+        tell(title, {"gap_rmse_m": free[place], "horizon_rmse_m": rungs[place]})
+    assert len(told) > 3 * len(BASES) and {key: figures for key, figures in told.items() if len(figures) > 1} == {}
+
+
 def test_effects_are_sought_on_the_law_of_the_data_too(tmp_path: Path) -> None:
     """IDM, which made the data, is better than the law that was to be completed; the hidden effect is found on it."""
     data = synthetic.generate(21, runs=8, followers=2, seconds=90.0, effect="leader_acceleration")[0]
@@ -71,7 +95,7 @@ def test_effects_are_sought_on_the_law_of_the_data_too(tmp_path: Path) -> None:
     assert "every driver's own" in rows[-1]["title"]
     error = {row["base"]: row["gap_rmse_m"] for row in rows if not row["own"]}
     assert min(error, key=error.get) == "idm"  # type: ignore[arg-type]
-    assert report["error"]["before"]["gap_rmse_m"] == pytest.approx(error["idm"], rel=0.02), "one calibration for all"
+    assert_a_model_has_one_figure(report)
     assert all(row["against"]["gap_rmse_m"]["ratio"] for row in rows[1:])
     together = report["completed"]["against"]["gap_rmse_m"]["ratio"]
     assert together == pytest.approx(report["error"]["after"]["gap_rmse_m"] / rows[0]["gap_rmse_m"])
@@ -107,6 +131,7 @@ def test_linear_controllers_have_their_law_and_what_it_lacks(effect: str | None,
             "idm",
         ]
         assert found.report["completed"]["against"]["gap_rmse_m"]["high"] < 0.5
+        assert_a_model_has_one_figure(found.report)
     else:
         assert found.report["reason"] == "law" and found.report["completed"] is None
         assert found.model.effects[0].name == "constant_time_gap"

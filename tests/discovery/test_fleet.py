@@ -30,7 +30,7 @@ def judged(records: Records, scale: np.ndarray, seed: int) -> Judged:
     gap, speed = (random.standard_normal(rows.valid.shape) * scale[rows.record][:, None] for _ in range(2))
     measured = [x[np.minimum(rows.samples, len(x) - 1)] for x in (records.gap, records.speed)]
     ahead = random.standard_normal(len(short)) * scale[short.record]
-    return Judged(rows, measured[0] + gap, measured[1] + speed, ahead, short.record, True, np.zeros(0))
+    return Judged(rows, measured[0] + gap, measured[1] + speed, ahead, short.record)
 
 
 def laws(records: Records, scales: np.ndarray, seed: int) -> tuple[list[Law], Among]:
@@ -48,7 +48,7 @@ def laws(records: Records, scales: np.ndarray, seed: int) -> tuple[list[Law], Am
         gap, speed = (x[wanted[of.rows.record], : part.valid.shape[1]] for x in (of.gap, of.speed))
         mine = wanted[of.ahead_record]
         record = (np.cumsum(wanted) - 1)[of.ahead_record[mine]]
-        return Judged(part, gap, speed, of.ahead[mine], record, True, np.zeros(0))
+        return Judged(part, gap, speed, of.ahead[mine], record)
 
     return found, among
 

@@ -14,7 +14,6 @@ from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
-from idm_env.discovery.search import first_noise
 from idm_env.discovery.verdict import HOLDS
 from idm_env.effects import BASES, base_named
 from tests.discovery.conftest import Mixing
@@ -47,10 +46,9 @@ def test_what_happens_before_a_driver_has_settled_moves_no_parameter(records: Re
 
 def test_all_time_is_scored_and_by_parameters_that_have_not_seen_it(records: Records) -> None:
     fold = np.array([0, 1])
-    noise = first_noise(windows(records))
 
     def judged(of: Records) -> judge.Judged:
-        return crossed.crossed(of, Hypothesis(), np.zeros((2, 0)), fold, noise)
+        return crossed.crossed(of, Hypothesis(), np.zeros((2, 0)), fold)
 
     rows = whole(records)
     second = judge.halves(rows)
@@ -69,11 +67,10 @@ def test_null_addition_and_other_laws_are_judged_by_one_procedure(monkeypatch: p
     models, looked_at, alike = [], [], set()
     right, best = crossed.crossed, crossed.at_best
 
-    def kept(records, model, values, fold, noise, *rest, **named):  # type: ignore[no-untyped-def]
+    def kept(records, model, values, fold, *rest, **named):  # type: ignore[no-untyped-def]
         models.append(model)
-        found = right(records, model, values, fold, noise, *rest, **named)
-        alike.add((id(records), fold.tobytes(), id(noise), found.whitened))
-        return found
+        alike.add((id(records), fold.tobytes()))
+        return right(records, model, values, fold, *rest, **named)
 
     def at_best(records, model, values, *start):  # type: ignore[no-untyped-def]
         errors, theta = best(records, model, values, *start)
@@ -85,7 +82,7 @@ def test_null_addition_and_other_laws_are_judged_by_one_procedure(monkeypatch: p
     made, _ = synthetic.generate(5, runs=8, followers=2, seconds=80.0, effect="lag")
     found = discover(made, effects=["lag"])
     assert found.verdict == "named"
-    assert len(alike) == 1, "the same runs, folds, noise and calibration for all"
+    assert len(alike) == 1, "the same runs and folds for all"
     assert {m.catalogue.base.kind for m, _ in looked_at} == set(BASES) and models[0] is found.null.model
     rows = {(row["base"], *row["own"]): row for row in found.report["bases"][1:]}
     (null, null_m), *others = looked_at

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from idm_env.data import episodes, hidden, synthetic
-from idm_env.discovery import judge, replica, search
+from idm_env.discovery import judge, replica
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis, curve, simple
+from idm_env.discovery.noise import first_noise
 from idm_env.discovery.records import gather, windows
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import LEAST_GAIN
@@ -21,7 +22,7 @@ def fitted(seed: int, ou: float, runs: int = 8, seconds: float = 120.0) -> tuple
     made, _ = synthetic.generate(seed, runs=runs, followers=3, seconds=seconds, ou=ou)
     records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     rows = windows(records)
-    problem = Problem(rows, search.first_noise(rows), first_prior())
+    problem = Problem(rows, first_noise(rows), first_prior())
     searching = Search(problem, ("drag",), False, Store(None, "", False), lambda *_: None)
     null = searching.null(Hypothesis(), np.tile(problem.prior.centre, (problem.groups, 1)))
     return judge.windowed(records, searching.problem, null)

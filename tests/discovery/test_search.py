@@ -16,6 +16,7 @@ from idm_env.discovery import model as terms, places, search, selection
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.march import COLUMNS
 from idm_env.discovery.model import Hypothesis
+from idm_env.discovery.noise import first_noise
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.score import SYSTEMATIC, half_width, held_out
 from idm_env.discovery.search import Search
@@ -31,7 +32,7 @@ from idm_env.simulator import Simulator
 def begun(records: Records, *names: str) -> tuple[Search, Solution]:
     """Return a search with its null."""
     rows = windows(records)
-    problem = Problem(rows, search.first_noise(rows), first_prior())
+    problem = Problem(rows, first_noise(rows), first_prior())
     searching = Search(problem, names, False, Store(None, "", False), lambda *_: None)
     return searching, searching.null(Hypothesis(), np.tile(problem.prior.centre, (problem.groups, 1)))
 

@@ -76,9 +76,7 @@ def test_the_file_of_a_shape_is_the_model_that_was_judged(closing: Discovery, tm
     records, kept = closing.records, closing.report["error"]["held_out_runs"]
     fold = crossed.folds_of(records.runs, kept, closing.report["seed"])
     values = crossed.values_of(closing.problem, closing.final, records.runs, fold)
-    before = closing.judgement.before
-    assert before is not None and closing.problem.noise is not None
-    errors = crossed.crossed(records, model, values, fold, closing.problem.noise, whitened=before.whitened).summary()
+    errors = crossed.crossed(records, model, values, fold).summary()
     after = closing.report["error"]["after"]
     assert {key: errors[key] for key in ERRORS} == pytest.approx({key: after[key] for key in ERRORS}, rel=0.02)
     estimates = [p["estimate"] for p in closing.report["found"][0]["parameters"].values()]

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from idm_env.data import episodes, synthetic
-from idm_env.discovery import closed_loop, model as terms, search, selection, together
+from idm_env.discovery import closed_loop, model as terms, selection, together
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis
+from idm_env.discovery.noise import first_noise
 from idm_env.discovery.records import gather, windows
 from idm_env.discovery.score import interval_of
 from idm_env.discovery.search import Search
@@ -23,7 +24,7 @@ def searching() -> Search:
     made, _ = synthetic.generate(31, runs=6, followers=3, seconds=120.0, effect="speed_time_gap")
     records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     rows = windows(records)
-    problem = Problem(rows, search.first_noise(rows), first_prior(), np.ones(len(rows)))
+    problem = Problem(rows, first_noise(rows), first_prior(), np.ones(len(rows)))
     return Search(problem, ("speed_time_gap", "drag"), False, Store(None, "", False), lambda *_: None)
 
 

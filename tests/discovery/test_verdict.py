@@ -129,6 +129,8 @@ def test_the_verdict_is_made_from_what_was_added_and_why_not_more() -> None:
 def test_an_outcome_needs_the_whole_interval_on_one_side() -> None:
     assert [c.outcome for c in (BETTER, SAME, WORSE)] == [ErrorChange.BETTER, ErrorChange.SAME, ErrorChange.WORSE]
     assert Comparison(1.0, 1.0, 1.0, float("nan"), float("nan")).outcome is ErrorChange.SAME
+    # Most followers' errors fall, and the pooled one does not.
+    assert replace(SAME, ratio=1.007, driver=(0.8, 0.7, 0.9)).outcome is ErrorChange.SAME
 
 
 def test_intervals_cover_the_true_change() -> None:

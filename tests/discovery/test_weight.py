@@ -10,9 +10,9 @@ from idm_env.data import episodes, synthetic
 from idm_env.discovery import closed_loop, judge, words
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis
+from idm_env.discovery.noise import first_noise
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.result import Weight
-from idm_env.discovery.search import first_noise
 from idm_env.discovery.solve import Problem, Solution, solve
 
 
