@@ -46,8 +46,23 @@ class Pictures:
     batch: Batch
     render_mode: str | None
     _viewers: tuple[Any, ...] = ()
+    _kept: tuple[list[Any], ...] = ()
 
-    def _pictures(self, count: int) -> list[np.ndarray | None]:
+    def _watch(self, count: int) -> None:
+        """Show what has just happened (``human``), or keep its pictures (``rgb_array_list``)."""
+        if self.render_mode == "human":
+            self._draw(1)
+        elif self.render_mode == "rgb_array_list":
+            self._kept = (*self._kept, self._draw(count))
+
+    def _pictures(self, count: int) -> list[Any]:
+        """Return what ``render`` does of the first environments. RuntimeError before ``reset``."""
+        if self.render_mode != "rgb_array_list":
+            return self._draw(count)
+        moments, self._kept = self._kept, ()
+        return [[picture for moment in moments for picture in moment[k]] for k in range(count)]
+
+    def _draw(self, count: int) -> list[Any]:
         """Return pictures of the first environments (``rgb_array``), or show them (``human``, and no ``render_mode``).
 
         RuntimeError before ``reset``.
@@ -59,9 +74,8 @@ class Pictures:
             raise RuntimeError("there is nothing to see before reset. Call reset() first.")
         from idm_env.envs.render import Viewer
 
-        fps = max(1, round(1.0 / self.task.step_time))
         missing = range(len(self._viewers), count)
-        self._viewers = (*self._viewers, *(Viewer(self.render_mode, fps) for _ in missing))
+        self._viewers = (*self._viewers, *(Viewer(self.render_mode) for _ in missing))
         state, params = self.batch.glance().state, self.batch.episode_params()
         return [viewer.show(self.task, state, row, params) for row, viewer in enumerate(self._viewers[:count])]
 
@@ -97,7 +111,8 @@ class Face(Pictures):
         """Take over what ``count`` environments are made of; return how many agents each has."""
         self.settings, self.task, self.render_mode = own, own.task, own.render_mode
         self.batch, self._numpy = Batch(own, count), own.output == "numpy"
-        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.task.step_time))}
+        fps = 10.0 if own.render_mode == "rgb_array_list" else 1.0 / self.task.step_time
+        self.metadata = {**type(self).metadata, "render_fps": max(1, round(fps))}
         return len(self.task.agents)
 
     @property
@@ -221,8 +236,7 @@ class DiffIDMEnv(Face, gymnasium.Env):
             # Without any seed the one that Gymnasium draws from the operating system is used.
             self.batch.seed([0], [self.np_random_seed if seed is None else seed])
         observation = self.batch.reset(state=chosen.get("state"))
-        if self.render_mode == "human":
-            self.render()
+        self._watch(1)
         return self._out(observation), begun(self.batch)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -231,8 +245,7 @@ class DiffIDMEnv(Face, gymnasium.Env):
             raise RuntimeError("step was called before reset. Call reset() first.")
         actions = None if action is None else action_of(action, self._shape, self.settings)[None]
         outcome = self.batch.step(actions)
-        if self.render_mode == "human":
-            self.render()
+        self._watch(1)
         reward, terminated, truncated = outcome.whole
         value = reward.item() if self._numpy else reward[0]
         ends = terminated.item(), truncated.item()
@@ -242,8 +255,11 @@ class DiffIDMEnv(Face, gymnasium.Env):
         flat = observation.reshape(-1)
         return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """Return a picture (``rgb_array``), or show it (``human``). RuntimeError before ``reset``."""
+    def render(self) -> Any:  # type: ignore[override]
+        """Return a picture (``rgb_array``), or show it (``human``). RuntimeError before ``reset``.
+
+        ``"rgb_array_list"`` is a list of those since the last call, ten a second where an action is held for longer.
+        """
         return self._pictures(1)[0]
 
     def close(self) -> None:

@@ -25,9 +25,9 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 from idm_env.envs.batch import Batch, Outcome
 from idm_env.envs.gym import Pictures
 from idm_env.envs.info import ids
-from idm_env.envs.settings import RENDER_MODES, settings
+from idm_env.envs.settings import RENDER_MODES, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, numpy_dtype, observation_box
-from idm_env.validation import whole
+from idm_env.validation import shown, whole
 
 _SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0
 
@@ -100,20 +100,20 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """Begin an episode: the first one of ``seed`` if that is given, the next one otherwise.
 
-        ``options["state"]`` is a ``State`` to start from. PettingZoo's own tests give others, so these are left aside.
+        ``options`` are those of ``DiffIDMEnv``; PettingZoo's own tests give another, ``"options"``, which says nothing.
         """
+        chosen = reset_options(options, ("state", "options", *self.task.begins_with))
+        self.batch.choose({name: x for name, x in chosen.items() if name in self.task.begins_with})
         if seed is not None or not self.batch.begun:
             self.batch.seed([0], [seeding.np_random(None if seed is None else whole("seed", seed, 0))[1]])
         # PettingZoo's own tests set it between episodes.
         self.batch.limit = self.max_cycles
-        state = options.get("state") if isinstance(options, dict) else None
-        seen = np.asarray(self.batch.reset(state=state)[0])
+        seen = np.asarray(self.batch.reset(state=chosen.get("state"))[0])
         self.agents = self._appear()
         while not self.agents:
             seen = np.asarray(self.batch.step(None).observation[0])
             self.agents = self._appear()
-        if self.render_mode == "human":
-            self.render()
+        self._watch(1)
         return self._by_agent(seen), {agent: self._begun(i) for i, agent in enumerate(self._slots) if agent}
 
     def step(
@@ -123,6 +123,8 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
 
         None as an action leaves an agent's vehicle to its driver; None in place of all of them leaves all.
         """
+        if not isinstance(actions, dict | None):
+            raise ValueError(f"actions = {shown(actions)} must map each of env.agents to its action.")
         if not self.agents:
             return {}, {}, {}, {}, {}
         before = self._slots
@@ -143,8 +145,7 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
         if self._journeys and self.agents:
             self._arrived(outcome, (observations, rewards, terminated, truncated, infos))
-        if self.render_mode == "human":
-            self.render()
+        self._watch(1)
         return observations, rewards, terminated, truncated, infos
 
     def _appear(self) -> list[str]:
@@ -229,8 +230,8 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         seen = torch.cat((traffic.speed / _SPEED_SCALE, gap), dim=-1)[0].cpu().numpy()
         return np.clip(seen, self.state_space.low, self.state_space.high)
 
-    def render(self) -> np.ndarray | None:
-        """Return a picture (``rgb_array``), or show it (``human``). RuntimeError before ``reset``."""
+    def render(self) -> Any:
+        """Return what ``DiffIDMEnv.render`` does. RuntimeError before ``reset``."""
         return self._pictures(1)[0]
 
     def close(self) -> None:

@@ -28,7 +28,7 @@ _NEAR = 85.0
 """How far from the agent one sees in the window around it (m): so much is drawn to scale."""
 _TOP, _EDGE, _BELOW = 72, 15, 54
 """Where the first road is drawn, the ground on both sides of it, and between two roads (pixels)."""
-_FRAMES = 10
+FRAMES = 10
 """Pictures a second in a window."""
 _LANE_PIXELS = 12.0, 20.0
 """A lane's width at least and at most; where the least is more than to scale, the picture says how much."""
@@ -155,12 +155,12 @@ def _views(task: Task, values: _Values, ego: int) -> list[_View]:
 class Viewer:
     """Draws one environment to scale: vehicles coloured by speed, agents framed in blue, crashes marked by a cross.
 
-    ``mode`` is ``"rgb_array"`` (a picture is returned; no display is needed) or ``"human"`` (a window; without a
-    display it is drawn into memory).
+    ``mode`` is ``"rgb_array"`` or ``"rgb_array_list"`` (pictures are returned; no display is needed) or ``"human"`` (a
+    window; without a display it is drawn into memory).
     """
 
-    def __init__(self, mode: str, fps: int) -> None:
-        self._pygame, self._mode, self._fps = _pygame(), mode, fps
+    def __init__(self, mode: str) -> None:
+        self._pygame, self._mode = _pygame(), mode
         self._window: Any = None
         self._clock: Any = None
         self._last: _Values | None = None
@@ -169,24 +169,27 @@ class Viewer:
         self._pygame.font.init()
         self._font, self._small = (self._pygame.font.Font(None, size) for size in (24, 20))
 
-    def show(self, task: Task, state: State, row: int = 0, params: Params | None = None) -> np.ndarray | None:
+    def show(self, task: Task, state: State, row: int = 0, params: Params | None = None) -> Any:
         """Return the picture of one row of a state as ``(height, width, 3)`` uint8, or show it in the window.
 
-        With the ``params`` of its episodes, what stands on the road is drawn, too.
+        In mode ``"rgb_array_list"`` it is a list of those since the last one, ten a second where an action is held for
+        longer. With the ``params`` of its episodes, what stands on the road is drawn, too.
         """
         values, params = _read(task, state, row), params or {}
         before, self._last = self._last, values
         self._watch(before, values)
         self._look(task, values["present"], values["position"])
-        if self._mode != "human":
-            picture = self._picture(task, values, row, params)
-            return np.transpose(self._pygame.surfarray.array3d(picture), (1, 0, 2)).copy()
-        frames, moments = max(1, round(_FRAMES / self._fps)), [values]
-        if before is not None and abs(values["time"] - before["time"] - task.step_time) < 1e-3:
+        frames, moments = max(1, round(FRAMES * task.step_time)), [values]
+        held = before is not None and abs(values["time"] - before["time"] - task.step_time) < 1e-3
+        if before is not None and held and self._mode != "rgb_array":
             moments = [_interpolated(before, values, k / frames) for k in range(1, frames)] + moments
-        for each in moments:
-            self._display(self._picture(task, each, row, params), frames)
-        return None
+        pictures = [self._picture(task, each, row, params) for each in moments]
+        if self._mode == "human":
+            for each in pictures:
+                self._display(each, frames / task.step_time)
+            return None
+        arrays = [np.transpose(self._pygame.surfarray.array3d(each), (1, 0, 2)).copy() for each in pictures]
+        return arrays if self._mode == "rgb_array_list" else arrays[-1]
 
     def _picture(self, task: Task, values: _Values, row: int, params: Params) -> Any:
         """Return a surface with the roads, what stands on them, and the legend."""
@@ -362,7 +365,7 @@ class Viewer:
         if (wider := view.lane / (LANE_M * view.scale)) >= 1.5:
             self._text(canvas, f"widths above: × {wider:.0f}", (after, level), 0.0)
 
-    def _display(self, canvas: Any, frames: int) -> None:
+    def _display(self, canvas: Any, fps: float) -> None:
         pygame = self._pygame
         if self._window is None:
             display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
@@ -376,7 +379,7 @@ class Viewer:
         pygame.event.pump()
         pygame.display.flip()
         if os.environ.get("SDL_VIDEODRIVER") != "dummy":
-            self._clock.tick(self._fps * frames)
+            self._clock.tick(fps)
 
     def close(self) -> None:
         """Close the window, if there is one."""

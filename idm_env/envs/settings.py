@@ -19,7 +19,7 @@ from idm_env.validation import nearest, one_of, shown
 
 OUTPUTS = ("numpy", "torch")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
-RENDER_MODES = ("rgb_array", "human")
+RENDER_MODES = ("rgb_array", "human", "rgb_array_list")
 INFO = (
     "accel", "command", "failsafe", "crash", "rewards", "vehicle_id", "lane_changes", "lane_refusals", "present",
     "queued", "inside", "outflow", "ramp", "standing", "co2", "travel",

@@ -75,8 +75,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         self._seed(seed, rows)
         observation = self.batch.reset(rows, chosen.get("state"))
         self._ended[rows] = False
-        if self.render_mode == "human":
-            self.render()
+        self._watch(self.num_envs)
         begun = np.zeros(self.num_envs, dtype=bool)
         begun[rows] = True
         return self._out(observation), self._rows.begun(begun)
@@ -99,9 +98,9 @@ class DiffIDMVectorEnv(Face, VectorEnv):
             if not self.batch.begun:
                 self.batch.seed(np.arange(self.num_envs), self._entropy())
             return
-        if not isinstance(seed, Iterable):
-            super().reset(seed=whole("seed", seed, 0))
-            seeds: Sequence[int | None] = [int(seed) + i for i in range(self.num_envs)]
+        if not isinstance(seed, Iterable) or not getattr(seed, "ndim", 1):
+            super().reset(seed=(first := whole("seed", seed, 0)))
+            seeds: Sequence[int | None] = [first + i for i in range(self.num_envs)]
         else:
             seeds = list(seed)
             if len(seeds) != self.num_envs:
@@ -146,8 +145,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
                 info |= self._final(observation, outcome)
                 observation = self.batch.reset(np.flatnonzero(self._ended))
                 self._ended = np.zeros(self.num_envs, dtype=bool)
-        if self.render_mode == "human":
-            self.render()
+        self._watch(self.num_envs)
         if self._numpy:
             reward = reward.astype(np.float64)
         return self._out(observation), reward, terminated, truncated, info
@@ -170,9 +168,9 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
 
     def render(self) -> Any:
-        """Return a picture of every environment (``rgb_array``), or show the first one (``human``).
+        """Return what ``DiffIDMEnv.render`` does, of every environment, or show the first one (``human``).
 
         RuntimeError before ``reset``.
         """
-        pictures = self._pictures(self.num_envs if self.render_mode == "rgb_array" else 1)
-        return tuple(pictures) if self.render_mode == "rgb_array" else None
+        pictures = self._pictures(1 if self.render_mode == "human" else self.num_envs)
+        return None if self.render_mode == "human" else tuple(pictures)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import ClassVar
 
 import torch
@@ -15,7 +15,7 @@ from idm_env.metrics import fuel
 from idm_env.roads import Lanes
 from idm_env.tasks.base import EnvState
 from idm_env.tasks.checks import Range, in_ranges
-from idm_env.tasks.features import AgentView, Feature
+from idm_env.tasks.features import AgentView, Feature, part
 from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import RewardTerm, Transition
@@ -39,16 +39,6 @@ def _signal(view: AgentView) -> tuple[Tensor, Tensor]:
     since, red = Signal.phase(view.task.simulator.time(view.state), signal)
     until = torch.where(red, signal["cycle"] - since, signal["cycle"] - signal["red"] - since)
     return view.own(red.to(since.dtype)), view.own(until)
-
-
-def _red(view: AgentView) -> Tensor:
-    """Return 1 where the signal is red."""
-    return view.once(_signal)[0]
-
-
-def _until(view: AgentView) -> Tensor:
-    """Return the time to the signal's next change (s)."""
-    return view.once(_signal)[1]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -164,8 +154,8 @@ class ApproachTask(OpenLanesTask):
         return (
             *super().features_of_self,
             Feature("line", "", "m", 100.0, 0.0, LINE, _line),
-            Feature("red", "", "", 1.0, 0.0, 1.0, _red),
-            Feature("until", "", "s", 10.0, 0.0, 3600.0, _until),
+            Feature("red", "", "", 1.0, 0.0, 1.0, partial(part, _signal, 0)),
+            Feature("until", "", "s", 10.0, 0.0, 3600.0, partial(part, _signal, 1)),
         )
 
     @property

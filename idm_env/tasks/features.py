@@ -73,6 +73,11 @@ Read = Callable[[AgentView], Tensor]
 """What an agent observes of a view, in SI units, shape ``(…, agents)``; differentiable where gradients are to flow."""
 
 
+def part(of: Callable[[AgentView], tuple[Tensor, ...]], k: int, view: AgentView) -> Tensor:
+    """Return the k-th of what ``of`` works out once for several features."""
+    return view.once(of)[k]
+
+
 @dataclass(frozen=True)
 class Feature:
     """One entry of an observation.

@@ -6,7 +6,7 @@ import abc
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import torch
@@ -18,7 +18,7 @@ from idm_env.multilane import demand
 from idm_env.roads import Lanes
 from idm_env.tasks.base import EnvState
 from idm_env.tasks.checks import FLOW, Range, entry
-from idm_env.tasks.features import AgentView, Feature, feature
+from idm_env.tasks.features import AgentView, Feature, feature, part
 from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import RewardTerm, Transition
@@ -59,16 +59,6 @@ def _next(view: AgentView) -> tuple[Tensor, Tensor]:
         next_end = torch.where(nearer, way, next_end)
         left = torch.where(nearer, (end.lane - lane).to(own.dtype), left)
     return task.there(state, next_end), task.there(state, left)
-
-
-def _next_end(view: AgentView) -> Tensor:
-    """Return how far it is to the next end of any lane (m)."""
-    return view.once(_next)[0]
-
-
-def _next_left(view: AgentView) -> Tensor:
-    """Return how many lanes to the left the next end is."""
-    return view.once(_next)[1]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -374,8 +364,8 @@ class OpenLanesTask(LanesTask):
             Feature("present", "", "", 1.0, 0.0, 1.0, _present),
             Feature("ends", "", "m", 100.0, 0.0, _SIGHT, _ends),
             feature("position", 100.0, 0.0, 1e6),
-            Feature("next_end", "", "m", 100.0, 0.0, _SIGHT, _next_end),
-            Feature("next_left", "", "lanes", 1.0, -last, last, _next_left),
+            Feature("next_end", "", "m", 100.0, 0.0, _SIGHT, partial(part, _next, 0)),
+            Feature("next_left", "", "lanes", 1.0, -last, last, partial(part, _next, 1)),
         )
 
     def info(self, world: EnvState) -> dict[str, Tensor]:

@@ -11,6 +11,7 @@ import torch
 
 import idm_env  # noqa: F401
 from idm_env import backends
+from idm_env.envs.pettingzoo import parallel_env
 from idm_env.tasks import TASKS, make_task
 
 
@@ -95,3 +96,24 @@ def test_pictures_are_shown_as_fast_as_time_goes_by(hold: float | None, fps: int
     single = gym.make("DiffIDM-v0", task="platoon", hold=hold)
     vector = gym.make_vec("DiffIDM-v0", num_envs=2, task="platoon", hold=hold)
     assert single.metadata["render_fps"] == vector.metadata["render_fps"] == fps
+
+
+@pytest.mark.parametrize(("hold", "each"), [(None, 1), (1.0, 10)])
+def test_a_list_of_pictures_has_ten_a_second(hold: float | None, each: int) -> None:
+    """A held action's too, in every face; the last of them is that of ``rgb_array``, and a call empties the list."""
+    made = {"task": "follow", "hold": hold}
+    single, still = (gym.make("DiffIDM-v0", render_mode=x, **made) for x in ("rgb_array_list", "rgb_array"))
+    vector = gym.make_vec("DiffIDM-v0", num_envs=2, render_mode="rgb_array_list", **made)
+    turns = parallel_env(render_mode="rgb_array_list", **made)
+    for env in (single, still, turns, vector):
+        env.reset(seed=3)
+    still.render()
+    assert single.metadata["render_fps"] == vector.metadata["render_fps"] == 10
+    assert [len(single.render()), len(turns.render()), *map(len, vector.render())] == [1, 1, 1, 1]
+    for env in (single, still, turns, vector):
+        env.step(None)
+        env.step(None)
+    moments = single.render()
+    assert [len(moments), len(turns.render()), *map(len, vector.render())] == [2 * each] * 4
+    np.testing.assert_array_equal(moments[-1], still.render())
+    assert single.render() == [] and (each == 1 or (moments[3] != moments[4]).any())

@@ -2,9 +2,11 @@
 
 import pickle
 
+import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
+import torch
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, render_test, seed_test
 from pettingzoo.test.max_cycles_test import max_cycles_test
 from pettingzoo.test.state_test import state_test
@@ -164,3 +166,22 @@ def test_agents_of_trips_come_and_go():
     assert began == ended <= set(many.possible_agents) and len(began) >= 5
     assert {name.split("_trip_")[0] for name in began} == {"vehicle_2", "vehicle_9"}
     assert last is not None
+
+
+@pytest.mark.parametrize("actions", [1.0, True, b"1", [0.0], np.zeros(1), {0.0}, lambda: 1, torch.zeros(1)], ids=repr)
+def test_actions_that_are_no_mapping_are_one_line(actions):
+    """Told by name before a step is done, as they are of a single environment."""
+    faces = parallel_env(task="follow")
+    faces.reset(seed=1)
+    with pytest.raises(ValueError, match=r"^actions = .* must map each of env\.agents to its action\.$"):
+        faces.step(actions)
+
+
+def test_options_of_a_reset_are_those_of_a_single_environment():
+    """What holds from now on does; an unknown one is refused, and PettingZoo's own is left aside."""
+    faces, single = parallel_env(task="ring", warmup=5), gymnasium.make("DiffIDM/Ring-v0", warmup=5)
+    seen, _ = faces.reset(seed=3, options={"length": 230.0, "options": 1})
+    np.testing.assert_array_equal(seen["vehicle_0"], single.reset(seed=3, options={"length": 230.0})[0])
+    for wrong, words in ({"lenght": 230.0}, "Did you mean 'length'"), ([1], "must be a mapping"):
+        with pytest.raises(ValueError, match=words):
+            faces.reset(options=wrong)

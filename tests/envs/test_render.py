@@ -210,7 +210,7 @@ def test_a_crash_is_marked_where_it_happens(task):
     env = gym.make("DiffIDM-v0", task=task, render_mode="rgb_array", **({"warmup": 0} if task == "ring" else {}))
     env.reset(seed=1)
 
-    viewer, state = Viewer("rgb_array", 10), env.unwrapped.state
+    viewer, state = Viewer("rgb_array"), env.unwrapped.state
 
     def marked(state):
         return int((viewer.show(env.unwrapped.task, state) == np.array([255, 210, 0])).all(-1).sum())

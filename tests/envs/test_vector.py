@@ -142,3 +142,11 @@ def test_torch_output_has_the_dense_layout():
     assert final["command"].shape == (COUNT, 1) and all(
         final[f"_{name}"].all() for name in ("command", "accel", "crash")
     )
+
+
+def test_a_seed_may_be_an_array_without_a_dimension():
+    """It is one number then: refused as of a single environment, where it is of another type."""
+    env = gym.make_vec("DiffIDM-v0", num_envs=2, task="follow")
+    for seed in np.array(3), torch.tensor(3):
+        with pytest.raises(ValueError, match=r"^seed = .* must be a whole number"):
+            env.reset(seed=seed)
