@@ -1,21 +1,24 @@
 """What every task teaches, by one measure: ``python -m benchmarks.tasks [ring follow …]``.
 
-*Skill* is (return − human)/(best known − human), human being ``step(None)``, and best known the best row of the table.
-Rows, all on the same 64 fresh episodes of the task with the keywords of ``GIVEN``:
+*Skill* is (return − human)/(best known − human), human being ``step(None)``, and best known the best row of the table;
+there is none where nobody does better than human drivers. Rows, all on the same 64 fresh episodes of the task with the
+keywords of ``GIVEN``:
 
 * *random*, *zero*, and the *constant* that is best of 13 accelerations on other episodes;
 * *rule*: IDM's formula as commands, its six numbers the best of a cross-entropy search that sees only returns;
-* *PPO*: Stable-Baselines3's, ten lines as in README, five seeds, each its last policy.
+* *PPO*: Stable-Baselines3's, ten lines as in README, its steps chosen by task, several seeds, each its last policy;
+* *APG*, on one lane: gradients through 50 decisions of 32 environments, 100 times, each seed's last policy;
+* *oracle*: that rule with the six numbers that are best in each of these episodes, found on it: what foresight
+  is worth.
 
 Beside each its CPU seconds of one thread, crashes, and the 95 % interval of the paired difference over episodes. A
-*first task* has zero, constants and random at most at 0.3, and PPO at least at 0.7 with 4 of 5 seeds in 120 CPU s.
-A row that is done is kept in ``--out``; ``docs/skill.csv`` has them all.
+*first task* has zero, constants and random at most at 0.3, and PPO at least at 0.7 with 4 of 5 seeds in 120 CPU s;
+the others are demonstrations. A row that is done is kept in ``--out``; ``docs/skill.csv`` has them all.
 """
 
 from __future__ import annotations
 
 import csv
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -46,10 +49,17 @@ TRAINING: dict[str, dict[str, Any]] = {"ring": {"warmup_pool": 256}}
 """Keywords of training alone: episodes begin in one of so many worlds."""
 STEPS = {"ring": 250_000, "follow": 200_000, "platoon": 150_000, "highway": 300_000}
 """Steps of PPO; of others 100 000."""
+WINDOWS = (50, 1e-2, 100)
+"""Of APG: decisions in a window, Adam's first step, which falls to 0, and windows."""
+GRADIENTS = ("follow", "platoon", "replay")
+"""Tasks that have a row of APG."""
 SEEN = {"features": ["speed", "lead_speed", "gap"], "scaling": "raw"}
 GENERATIONS, RULES = 8, 16
 RANGES = ((2.5, 40.0), (0.1, 3.0), (0.3, 6.0), (0.3, 3.0), (0.5, 4.0), (0.005, 1.0))
 """Where rules are looked for: v0 (m/s), T (s), s0 (m), a, b (m/s²), and the share of IDM's acceleration."""
+
+IDLE, LEARNT = ("random", "zero", "constant"), ("PPO", "APG")
+"""Rows of what learns nothing, and those that have seeds."""
 
 Act = Callable[[np.ndarray], np.ndarray]
 
@@ -100,24 +110,62 @@ def rule(task: str, values: np.ndarray) -> Act:
     return act
 
 
-def searched(task: str) -> Act:
+def paid(task: str, rules: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
+    """Return what rules, ``(…, rules, 6)`` in logarithms, return in episodes of these seeds, one for each row."""
+    return returns(task, rule(task, np.exp(rules.reshape(-1, rules.shape[-1]))), seeds, observation=SEEN)[0]
+
+
+def searched(task: str) -> np.ndarray:
     """Return the rule with the best mean return, by the cross-entropy method over the logarithms of its numbers."""
     drawing = np.random.default_rng(0)
     low, high = np.log(RANGES).T
     middle, spread = (low + high) / 2.0, (high - low) / 2.0
 
-    def paid(rules: np.ndarray, first: int, episodes: int) -> np.ndarray:
-        act = rule(task, np.exp(rules).repeat(episodes, 0))
-        pays, _ = returns(task, act, [*range(first, first + episodes)] * len(rules), observation=SEEN)
+    def mean(rules: np.ndarray, first: int, episodes: int) -> np.ndarray:
+        pays = paid(task, rules.repeat(episodes, 0), [*range(first, first + episodes)] * len(rules))
         return pays.reshape(len(rules), -1).mean(1)
 
     for generation in range(GENERATIONS):
         rules = (middle + spread * drawing.standard_normal((RULES, len(RANGES)))).clip(low, high)
         rules[0] = middle
-        best = rules[np.argsort(paid(rules, OTHERS + 100 + 4 * generation, 4))[-RULES // 4 :]]
+        best = rules[np.argsort(mean(rules, OTHERS + 100 + 4 * generation, 4))[-RULES // 4 :]]
         middle, spread = best.mean(0), best.std(0) + 0.05 * (high - low)
     best = np.concatenate((best, middle[None]))
-    return rule(task, np.exp(best[int(paid(best, OTHERS + 200, 16).argmax())]))
+    return np.exp(best[int(mean(best, OTHERS + 200, 16).argmax())])
+
+
+def oracle(task: str, known: np.ndarray) -> np.ndarray:
+    """Return the best rule found in each of the episodes that judge, ``(episodes, 6)``, beginning with ``known``."""
+    drawing, each = np.random.default_rng(0), range(FRESH, FRESH + EPISODES)
+    low, high = np.log(RANGES).T
+    best, spread = np.tile(np.log(known), (EPISODES, 1)), 0.3 * (high - low)
+    for _ in range(GENERATIONS // 2):
+        steps = spread * drawing.standard_normal((EPISODES, RULES // 2, len(RANGES)))
+        steps[:, 0] = 0.0
+        rules = (best[:, None] + steps).clip(low, high)
+        pays = paid(task, rules, np.repeat(each, RULES // 2).tolist()).reshape(EPISODES, -1)
+        best, spread = rules[np.arange(EPISODES), pays.argmax(1)], 0.6 * spread
+    return np.exp(best)
+
+
+def apg(task: str, seed: int) -> Act:
+    """Return the last policy of ascending gradients through windows of traffic; README's second figure."""
+    torch.manual_seed(seed)
+    keywords = {**GIVEN.get(task, {}), **TRAINING.get(task, {})}
+    env = gymnasium.make_vec("DiffIDM-v0", num_envs=32, task=task, output="torch", **keywords)
+    seen, _ = env.reset(seed=seed)
+    layers = [torch.nn.Linear(seen.shape[1], 64), torch.nn.Linear(64, 64), torch.nn.Linear(64, 1)]
+    policy = torch.nn.Sequential(*(part for layer in layers for part in (layer, torch.nn.Tanh())))
+    layers[-1].weight.data *= 0.01
+    ascent = torch.optim.Adam(policy.parameters(), WINDOWS[1], maximize=True)
+    for update in range(WINDOWS[2]):
+        ascent.param_groups[0]["lr"] = WINDOWS[1] * (1.0 - update / WINDOWS[2])
+        env.unwrapped.detach()  # type: ignore[attr-defined]
+        ascent.zero_grad()
+        env.unwrapped.unroll(policy, steps=WINDOWS[0]).reward.mean().backward()  # type: ignore[attr-defined]
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+        ascent.step()
+    return lambda seen: policy(torch.as_tensor(seen)).detach().numpy()
 
 
 def ppo(task: str, seed: int) -> Act:
@@ -151,12 +199,13 @@ def row_of(part: Part, on_progress: OnProgress) -> dict[str, Any]:
     begin = time.process_time()
     makers: dict[str, Callable[[], Act | None]] = {
         "human": lambda: None, "zero": lambda: held(part.task, 0.0), "random": lambda: random(part.task),
-        "constant": lambda: constant(part.task), "rule": lambda: searched(part.task),
-        "PPO": lambda: ppo(part.task, part.seed),
+        "constant": lambda: constant(part.task), "rule": lambda: rule(part.task, searched(part.task)),
+        "oracle": lambda: rule(part.task, oracle(part.task, searched(part.task))),
+        "PPO": lambda: ppo(part.task, part.seed), "APG": lambda: apg(part.task, part.seed),
     }  # fmt: skip
     act = makers[part.row]()
     spent = time.process_time() - begin
-    more = {"observation": SEEN} if part.row == "rule" else {}
+    more = {"observation": SEEN} if part.row in ("rule", "oracle") else {}
     totals, crashes = returns(part.task, act, range(FRESH, FRESH + EPISODES), **more)
     return {"seconds": spent, "returns": totals.tolist(), "crashes": crashes}
 
@@ -167,37 +216,44 @@ def skills(rows: dict[Part, dict[str, Any]]) -> list[list[str]]:
     best = max(float(np.mean(x["returns"])) for x in rows.values()) - human.mean()
     lines = []
     for part, row in rows.items():
-        more = (np.array(row["returns"]) - human) / best
+        more = np.array(row["returns"]) - human
         half = 1.96 * float(more.std(ddof=1)) / len(more) ** 0.5
-        numbers = f"{np.mean(row['returns']):.1f}", f"{more.mean():.2f}", f"{half:.2f}"
+        skill = (f"{more.mean() / best:.2f}", f"{half / best:.2f}") if best > 0.0 else ("", "")
         crashes, spent = f"{row['crashes']}/{len(more)}", f"{row['seconds']:.0f}"
+        numbers = f"{np.mean(row['returns']):.1f}", *skill
         lines.append([part.task, part.row, str(part.seed), *numbers, crashes, spent])
     return lines
 
 
+def teaches(lines: list[list[str]]) -> bool:
+    """Return whether the lines of a task's table are those of a first task."""
+    skill = {name: [float(line[4] or "-inf") for line in lines if line[1] == name] for name in (*IDLE, "PPO")}
+    idle = max(x for name in IDLE for x in skill[name])
+    fast = all(float(line[7]) <= 120.0 for line in lines if line[1] == "PPO")
+    return idle <= 0.3 and fast and len(skill["PPO"]) >= 5 and sorted(skill["PPO"])[-4] >= 0.7
+
+
 def main(
-    tasks: tyro.conf.Positional[Sequence[str]] = (), rows: Sequence[str] = ("PPO", "rule"), seeds: int = 5,
+    tasks: tyro.conf.Positional[Sequence[str]] = (), rows: Sequence[str] = ("rule", "oracle", *LEARNT), seeds: int = 5,
     out: Path = Path("runs/tasks.jsonl"), place: Workers = HERE,
 ) -> None:  # fmt: skip
     """Print the table of each task, and keep it in docs/skill.csv.
 
     Args:
         tasks: All if none is named.
-        rows: Beside those that cost nothing: PPO, rule.
-        seeds: Of PPO.
+        rows: Beside those that cost nothing: rule, oracle, PPO, APG.
+        seeds: Of PPO and APG.
         out: File of rows.
         place: Where rows are worked out.
     """
     file, head = ROOT / "docs" / "skill.csv", ["task", "row", "seed", "return", "skill", "±", "crashes", "CPU s"]
     for task in tasks or TASKS:
-        parts = [Part(task, row) for row in ("human", "random", "zero", "constant", *(x for x in rows if x != "PPO"))]
-        parts += [Part(task, "PPO", seed) for seed in range(seeds if "PPO" in rows else 0)]
+        parts = [Part(task, row) for row in ("human", *IDLE, *(x for x in rows if x not in LEARNT))]
+        learns = [x for x in LEARNT if x in rows and (x == "PPO" or task in GRADIENTS)]
+        parts += [Part(task, row, seed) for row in learns for seed in range(seeds)]
         done = named_rows(row_of, {str(part): part for part in parts}, out, place)
         lines = skills({part: done[str(part)] for part in parts})
-        print(table(head, lines))
-        learnt = [float(line[4]) for line in lines if line[1] == "PPO"]
-        if learnt:
-            print(f"PPO: median {statistics.median(learnt):.2f}, at least 0.7 with {sum(x >= 0.7 for x in learnt)}\n")
+        print(table(head, lines), f"\n{task}: a {'first task' if teaches(lines) else 'demonstration'}\n")
         old = list(csv.reader(file.open(encoding="utf-8")))[1:] if file.exists() else []
         every = sorted([x for x in old if x[0] != task] + lines, key=lambda x: list(TASKS).index(x[0]))
         with file.open("w", encoding="utf-8", newline="") as out_file:

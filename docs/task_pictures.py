@@ -65,10 +65,10 @@ def film(name: str, act: Any, **keywords: Any) -> list[Image.Image]:
 def moving(name: str, folder: Path = FOLDER) -> Path:
     """Draw human drivers and the searched rule on the same episode, beside or above each other; return the file."""
     sys.path.insert(0, str(FOLDER.parents[1]))
-    from benchmarks.tasks import GIVEN, SEEN, searched
+    from benchmarks.tasks import GIVEN, SEEN, rule, searched
 
-    keywords = GIVEN.get(name, {})
-    pairs = zip(film(name, None, **keywords), film(name, searched(name), observation=SEEN, **keywords), strict=False)
+    keywords, act = GIVEN.get(name, {}), rule(name, searched(name))
+    pairs = zip(film(name, None, **keywords), film(name, act, observation=SEEN, **keywords), strict=False)
     frames = []
     for pair in pairs:
         wide, high = pair[0].size
