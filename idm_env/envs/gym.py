@@ -56,7 +56,7 @@ class Pictures:
             self._kept = (*self._kept, self._draw(count))
 
     def _pictures(self, count: int) -> list[Any]:
-        """Return what ``render`` does of the first environments. RuntimeError before ``reset``."""
+        """Return pictures of the first environments, as ``render``. RuntimeError before ``reset``."""
         if self.render_mode != "rgb_array_list":
             return self._draw(count)
         moments, self._kept = self._kept, ()
@@ -78,6 +78,13 @@ class Pictures:
         self._viewers = (*self._viewers, *(Viewer(self.render_mode) for _ in missing))
         state, params = self.batch.glance().state, self.batch.episode_params()
         return [viewer.show(self.task, state, row, params) for row, viewer in enumerate(self._viewers[:count])]
+
+    def render(self) -> Any:
+        """Return a picture (``rgb_array``), or show it (``human``). RuntimeError before ``reset``.
+
+        ``"rgb_array_list"`` is a list of those since the last call, ten a second where an action is held for longer.
+        """
+        return self._pictures(1)[0]
 
     def record(self) -> Recorder:
         """Record every vehicle from now on; return a ``Recorder`` with the methods ``table()`` and ``write``.
@@ -254,13 +261,6 @@ class DiffIDMEnv(Face, gymnasium.Env):
     def _out(self, observation: Any) -> Any:
         flat = observation.reshape(-1)
         return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
-
-    def render(self) -> Any:  # type: ignore[override]
-        """Return a picture (``rgb_array``), or show it (``human``). RuntimeError before ``reset``.
-
-        ``"rgb_array_list"`` is a list of those since the last call, ten a second where an action is held for longer.
-        """
-        return self._pictures(1)[0]
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -77,8 +77,7 @@ def single(batch: Batch, outcome: Outcome) -> dict[str, Any]:
     """Return the info of a step of a single environment."""
     info: dict[str, Any] = {name: value[0] for name, value in outcome.details.items()}
     if "crash" in info:
-        crash = info["crash"]
-        info["crash"] = crash.item() if len(batch.task.agents) == 1 else bool(crash.any())
+        info["crash"] = bool(info["crash"].any())
     if info.get("crash"):
         info["crash_reason"] = batch.crash_reason(0)
     return info | begun(batch) if batch.task.vehicle_ids else info
@@ -96,9 +95,7 @@ class Rows:
 
     def __init__(self, batch: Batch) -> None:
         self.batch = batch
-        self._torch = batch.settings.output == "torch"
-        names = ids(batch)
-        self._ids = None
+        self._torch, self._ids, names = batch.settings.output == "torch", None, ids(batch)
         if names is not None:
             self._ids = np.empty(batch.count, dtype=object)
             for row in range(batch.count):  # numpy would fill in the codes

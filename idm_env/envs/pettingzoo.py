@@ -230,10 +230,6 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         seen = torch.cat((traffic.speed / _SPEED_SCALE, gap), dim=-1)[0].cpu().numpy()
         return np.clip(seen, self.state_space.low, self.state_space.high)
 
-    def render(self) -> Any:
-        """Return what ``DiffIDMEnv.render`` does. RuntimeError before ``reset``."""
-        return self._pictures(1)[0]
-
     def close(self) -> None:
         """Close the window, if there is one."""
         self.close_extras()
@@ -250,11 +246,6 @@ def env(**keywords: Any) -> Any:
     return turns if isinstance(turns, OrderEnforcingWrapper) else OrderEnforcingWrapper(turns)
 
 
-def _register() -> None:
-    """Make ``pettingzoo.make("parallel", "diffidm_v0")`` known, from PettingZoo 1.27 on."""
-    if hasattr(pettingzoo, "register"):
-        pettingzoo.register("parallel", "diffidm_v0", f"{__name__}:parallel_env")
-        pettingzoo.register("aec", "diffidm_v0", f"{__name__}:env")
-
-
-_register()
+if hasattr(pettingzoo, "register"):  # from 1.27 on ``pettingzoo.make("parallel", "diffidm_v0")``
+    for kind, face in ("parallel", "parallel_env"), ("aec", "env"):
+        pettingzoo.register(kind, "diffidm_v0", f"{__name__}:{face}")

@@ -94,21 +94,18 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         return np.flatnonzero(mask)
 
     def _seed(self, seed: int | Sequence[int | None] | None, rows: np.ndarray) -> None:
-        if seed is None:
-            if not self.batch.begun:
-                self.batch.seed(np.arange(self.num_envs), self._entropy())
-            return
-        if not isinstance(seed, Iterable) or not getattr(seed, "ndim", 1):
-            super().reset(seed=(first := whole("seed", seed, 0)))
-            seeds: Sequence[int | None] = [first + i for i in range(self.num_envs)]
-        else:
+        seeds: list[int | None] = [None] * self.num_envs
+        if isinstance(seed, Iterable) and getattr(seed, "ndim", True):
             seeds = list(seed)
-            if len(seeds) != self.num_envs:
-                raise ValueError(f"seed has {len(seeds)} values for {self.num_envs} environments: give 1 or as many.")
-            if not self.batch.begun and None in seeds:
-                self.batch.seed(np.arange(self.num_envs), self._entropy())
-        seeded = [row for row in rows if seeds[row] is not None]
-        self.batch.seed(seeded, [seed for row in seeded if (seed := seeds[row]) is not None])
+        elif seed is not None:
+            super().reset(seed=(first := whole("seed", seed, 0)))
+            seeds = [first + i for i in range(self.num_envs)]
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed has {len(seeds)} values for {self.num_envs} environments: give 1 or as many.")
+        if not self.batch.begun and None in seeds:
+            self.batch.seed(np.arange(self.num_envs), self._entropy())
+        if seeded := [(row, number) for row in rows if (number := seeds[row]) is not None]:
+            self.batch.seed(*map(list, zip(*seeded, strict=True)))
 
     def _entropy(self) -> list[int]:
         """Return the seeds that follow the one that Gymnasium draws from the operating system."""
@@ -168,7 +165,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
 
     def render(self) -> Any:
-        """Return what ``DiffIDMEnv.render`` does, of every environment, or show the first one (``human``).
+        """Return pictures of every environment, as ``DiffIDMEnv.render``, or show the first one (``human``).
 
         RuntimeError before ``reset``.
         """

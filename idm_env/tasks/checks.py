@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
+from os import PathLike
 from typing import Any, NamedTuple
 
 from idm_env.model_file import nested
@@ -115,6 +116,8 @@ def in_ranges(task: Any) -> None:
         value = getattr(task, field.name)
         if isinstance(field.default, bool) and not isinstance(value, bool):
             raise ValueError(f"{field.name} = {shown(value)} must be True or False.")
+        if field.type == "str | None" and not isinstance(value, str | PathLike | None):
+            raise ValueError(f"{field.name} = {shown(value)} must be a text.")
         if field.name in by_name and not (value is None and field.default is None):
             by_name[field.name].check(field.name, value)
             if isinstance(value, Real) and not isinstance(value, (int, float)):  # a fraction, or numpy's

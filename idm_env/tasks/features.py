@@ -63,7 +63,7 @@ class AgentView:
         return x
 
     def once(self, of: Callable[[AgentView], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
-        """Return what several features read a part of: worked out for the first of them."""
+        """Return the entries that several features share: worked out for the first of them."""
         if of not in self._known:
             self._known[of] = of(self)
         return self._known[of]
@@ -74,7 +74,7 @@ Read = Callable[[AgentView], Tensor]
 
 
 def part(of: Callable[[AgentView], tuple[Tensor, ...]], k: int, view: AgentView) -> Tensor:
-    """Return the k-th of what ``of`` works out once for several features."""
+    """Return the k-th entry of ``of``, worked out once for several features."""
     return view.once(of)[k]
 
 

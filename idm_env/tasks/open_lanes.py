@@ -423,7 +423,7 @@ class OpenLanesTask(LanesTask):
         return 1.0 - (self.lost(step.after) / due.clamp_min(1.0)).unsqueeze(-1)
 
     def _delay(self, step: Transition) -> Tensor:
-        """Return what ``delay`` does (vehicles)."""
+        """Return the delay of a moment (vehicles)."""
         return self.delay(step.after).unsqueeze(-1)
 
     def lost(self, world: EnvState) -> Tensor:
@@ -434,7 +434,7 @@ class OpenLanesTask(LanesTask):
         return (lost * state.present).sum(-1) + demand.counts(self.simulator, state).queued
 
     def delay(self, world: EnvState) -> Tensor:
-        """Return what is lost in a moment (vehicles)."""
+        """Return the delay of a moment (vehicles)."""
         return self.lost(world)
 
     def crashed(self, world: EnvState) -> Tensor:

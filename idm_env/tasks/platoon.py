@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
@@ -84,8 +84,8 @@ class PlatoonTask(BehindHeadTask):
     @property
     def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
         """``unit``, and the quadratic costs."""
-        own = RewardTerm("steady", "h/(1 + (Δv_i/A)²)", "", 0.0, 1.0, self._steady)
-        last = RewardTerm("last", "h/(1 + (Δv_last/A)²)", "", 0.0, 1.0, self._last)
+        own = RewardTerm("steady", "h/(1 + (Δv_i/A)²)", "", 0.0, 1.0, partial(self._steady, self.pick))
+        last = RewardTerm("last", "h/(1 + (Δv_last/A)²)", "", 0.0, 1.0, partial(self._steady, _last))
         quadratic = RewardTerm("quadratic", "", "", _LOWEST, 0.0, self._quadratic)
         unit = {last: 0.4, own: 0.3, REWARD_TERMS["headway"]: 0.3}
         return {"unit": unit, "quadratic": {quadratic: 1.0}}
@@ -112,23 +112,24 @@ class PlatoonTask(BehindHeadTask):
         accel = (amplitude * (-frequency * angle.sin() + 0.1 * start * fade)).sum(-1)
         return torch.stack((position, speed, accel), dim=-1)
 
-    def _steady(self, step: Transition) -> Tensor:
-        """Return ``h/(1 + ((v_i − v̄)/A)²)``, h the headway's term."""
-        return headway(step) / (1.0 + ((self.pick(step.after.state.speed) - self.speed) / self.disturbance).square())
-
-    def _last(self, step: Transition) -> Tensor:
-        """Return ``h/(1 + ((v_last − v̄)/A)²)``, h the headway's term."""
-        return headway(step) / (1.0 + ((step.after.state.speed[..., -1:] - self.speed) / self.disturbance).square())
+    def _steady(self, pick: Callable[[Tensor], Tensor], step: Transition) -> Tensor:
+        """Return ``h/(1 + ((v − v̄)/A)²)``, h the headway's term and v a picked speed."""
+        return headway(step) / (1.0 + ((pick(step.after.state.speed) - self.speed) / self.disturbance).square())
 
     def _quadratic(self, step: Transition) -> Tensor:
         """Return minus the quadratic costs of speed and effort, and of time gaps out of bounds."""
         state, command = step.after.state, step.command
-        speed, last = self.pick(state.speed), state.speed[..., -1:]
+        speed, last = self.pick(state.speed), _last(state.speed)
         off, off_last = speed - self.speed, last - self.speed
         time_gap = self.pick(state.gap) / speed.clamp_min(1.0)
         close, far = 2.0 * torch.relu(1.0 - time_gap / 0.8), torch.relu(time_gap / 4.0 - 1.0)
         reward = -(off * off + off_last * off_last) / (2.0 * self.disturbance**2) - 0.1 * command * command
         return floored(reward - close - far, _KNEE, _LOWEST)
+
+
+def _last(x: Tensor) -> Tensor:
+    """Return the last vehicle's entry, ``(…, 1)``."""
+    return x[..., -1:]
 
 
 def _deviation(mean: float, view: AgentView) -> Tensor:

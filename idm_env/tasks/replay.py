@@ -72,6 +72,8 @@ class ReplayTask(Task):
         in_ranges(self)
         if self.vehicles:
             raise ValueError(f"vehicles = {self.vehicles}, but the file of task 'replay' decides. Leave it out.")
+        if self.runs is not None and (self.data is None or not isinstance(self.runs, list | tuple)):
+            raise ValueError(f"runs = {shown(self.runs)} must be a list of runs of a file. Give data, too, or no runs.")
         if self.warmup:
             raise ValueError(f"warmup = {self.warmup}, but a replay begins from its record. Leave it out.")
         # The simulator needs no number of vehicles; everything that does comes after this line.
@@ -193,7 +195,7 @@ class ReplayTask(Task):
         mine = np.zeros(self.vehicles, bool)
         if self.model == "all":
             mine |= self.scene.led.any(0) & (np.array(self.scene.ids) != NOBODY)
-        elif isinstance(self.model, str):
+        elif isinstance(self.model, str) or not isinstance(self.model, Sequence):
             raise ValueError(f"model = {shown(self.model)} must be 'all' or a list of vehicles.")
         else:
             mine[[self._slot(vehicle) for vehicle in self.model]] = True

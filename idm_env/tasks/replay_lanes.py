@@ -54,7 +54,7 @@ class ReplayLanesTask(ReplayTask, LanesTask):
     def __post_init__(self) -> None:
         one_of("lane_changes", self.lane_changes, LANE_CHANGES)
         one_of("first_lane", self.first_lane, FIRST_LANES)
-        if self.runs is not None and len(self.runs) != 1:
+        if isinstance(self.runs, list | tuple) and len(self.runs) != 1:
             raise ValueError(f"runs = {list(self.runs)} must name one run: runs are different roads.")
         super().__post_init__()
 

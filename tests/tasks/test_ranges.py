@@ -140,3 +140,11 @@ def test_what_no_memory_holds_is_refused_in_every_face(make: Any) -> None:
 def test_a_road_goes_on(ends: Any, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         Lanes(2, length=500.0, ends=ends)
+
+
+@pytest.mark.parametrize("value", [math.inf, True, 1j, HUGE, object(), len], ids=str)
+@pytest.mark.parametrize("option", ["data", "runs", "model"])
+def test_what_a_replay_is_of_has_a_type(option: str, value: Any) -> None:
+    """Told by name and in one line; runs of no file are refused, too."""
+    assert refused("replay", option, value).startswith(f"{option} = ")
+    assert "Give data" in refused("replay", "runs", ["a"])
