@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
 
+import numpy as np
 import tyro
 
 from benchmarks import command
@@ -22,14 +23,70 @@ from idm_env.data.womd import scenarios
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.jobs.workers import HERE, Workers
 from idm_env.prediction.files import OURS, case_of
-from idm_env.prediction.metrics import Score, score, summary
-from idm_env.prediction.mixture import SHARES, Seen, Shares, fit_shares, score_hits
+from idm_env.prediction.metrics import HORIZONS, Case, Score, hits, score, summary
+from idm_env.prediction.mixture import SHARES, Shares, pace_of
 from idm_env.prediction.predict import METHODS, Mixture, Prediction, choose_futures, mixture
 from idm_env.prediction.scene import MapScene
 
 STRAIGHT = "constant velocity"
 LEAST_S = 3
 """Agents whose future is known up to here (s) are scored; later horizons where they are known too."""
+PRIOR_AGENTS = 2.0
+"""Weight of equal shares, which are the prior (agents)."""
+NOT_HIT = 1e-3
+"""Chance (per way) that an agent ends where none of its futures does."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One agent whose future is known: the share [H, 3] of each way's futures that hit it, per known horizon.
+
+    NaN where it has no such futures (no lane).
+    """
+
+    kind: str
+    pace: str
+    hit: np.ndarray
+
+
+def score_hits(case: Case, futures: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Seen | None:
+    """Return how the futures [N, S, 2] of each way, with weights [N], hit the truth of a case; None without a truth."""
+    rows = []
+    for seconds in HORIZONS:
+        reached = [hits(replace(case, futures=one), seconds) if len(one) else None for one in futures]
+        if any(hit is not None for hit in reached):
+            parts = zip(reached, weights, strict=True)
+            rows.append([np.nan if hit is None else float((hit * w).sum() / w.sum()) for hit, w in parts])
+    return Seen(case.kind, pace_of(case.speed), np.array(rows)) if rows else None
+
+
+def fit_shares(agents: Iterable[Seen]) -> Shares:
+    """Return the shares of every kind and pace; those of which no agent is seen keep the prior."""
+    every = list(agents)
+    shares: Shares = {}
+    for kind, pace in SHARES:
+        prior = np.array([0.5, 0.5, 0.0] if kind == "pedestrian" else [1 / 3, 1 / 3, 1 / 3])
+        group = [one.hit for one in every if (one.kind, one.pace) == (kind, pace)]
+        shares[kind, pace] = tuple(float(x) for x in _expectation_maximisation(group, prior))
+    return shares
+
+
+def _expectation_maximisation(group: Sequence[np.ndarray], prior: np.ndarray) -> np.ndarray:
+    """Return the shares of highest posterior density; every agent counts once, evenly over its horizons."""
+    if not group:
+        return prior
+    chance = np.concatenate(group) + NOT_HIT
+    counted = np.concatenate([np.full(len(hit), 1.0 / len(hit)) for hit in group])
+    finite = np.isfinite(chance)
+    share = prior
+    for _ in range(200):
+        # what an agent cannot do tells nothing of its share: there it explains as well as the others on average
+        mean = (share * np.where(finite, chance, 0.0)).sum(-1) / (share * finite).sum(-1)
+        part = share * np.where(finite, chance, mean[:, None])
+        part = part / part.sum(-1, keepdims=True)
+        share = PRIOR_AGENTS * prior + counted @ part
+        share = share / share.sum()
+    return np.asarray(share)
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,37 +99,6 @@ def defaults(
     }
 
 
-def null(
-    effects: Iterable[HasParameters], *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
-) -> dict[str, dict[str, Tensor]]:
-    """Return defaults with every parameter that has a null set to it: each such effect is absent."""
-    return {
-        e.name: {
-            p.name: torch.tensor(p.default if p.null is None else p.null, dtype=dtype, device=device)
-            for p in e.parameters
-        }
-        for e in effects
-    }
-
-
-def sample(
-    effects: Iterable[HasParameters],
-    shape: tuple[int, ...],
-    generator: torch.Generator,
-    *,
-    spread: float = 1.0,
-    dtype: torch.dtype | None = None,
-) -> dict[str, dict[str, Tensor]]:
-    """Draw every parameter uniformly from ``default ± spread · (bound − default)``, so never outside its bounds."""
-
-    def draw(p: Parameter) -> Tensor:
-        low = p.default + spread * (p.low - p.default)
-        high = p.default + spread * (p.high - p.default)
-        return low + (high - low) * torch.rand(shape, generator=generator, dtype=dtype)
-
-    return {e.name: {p.name: draw(p) for p in e.parameters} for e in effects}
-
-
 def constrain(parameter: Parameter, free: Tensor) -> Tensor:
     """Map the real line onto the parameter's bounds."""
     return parameter.transform()(free)

@@ -123,12 +123,6 @@ def count(path: Path) -> int:
     return number
 
 
-def frame(data: bytes) -> bytes:
-    """Return one record of a TFRecord file."""
-    head = struct.pack("<Q", len(data))
-    return head + struct.pack("<I", masked_crc(head)) + data + struct.pack("<I", masked_crc(data))
-
-
 @lru_cache(maxsize=1)
 def _table() -> list[int]:
     """Return the byte table of CRC-32C (Castagnoli, reflected polynomial 0x82F63B78)."""

@@ -5,7 +5,6 @@ Shapes: everything is elementwise over vehicles, ``[..., n]``, in SI units.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -67,23 +66,6 @@ def equilibrium_gap(driver: Driver, speed: Tensor) -> Tensor:
     """Return the gap at which IDM drivers keep a speed (m): ``(s0 + v T)/√(1 − (v/v0)⁴)``, v at most 0.95 v0."""
     ratio = (speed / driver.desired_speed).clamp(0.0, 0.95)
     return (driver.min_gap + speed * driver.time_gap) / torch.sqrt(1.0 - ratio**4)
-
-
-def equilibrium_speed(gap: Tensor, driver: Mapping[str, Tensor], exponent: float = 4.0) -> Tensor:
-    """Return the speed at which IDM drivers with this gap do not accelerate (m/s), by bisection in [0, v0].
-
-    Solves ``1 − (v/v0)^δ = ((s0 + v T)/s)²``; 0 where the gap is not above s0. ``driver`` holds ``min_gap``,
-    ``time_gap`` and ``desired_speed`` as in ``params["idm"]``.
-    """
-    with torch.no_grad():
-        low = torch.zeros_like(gap)
-        high = driver["desired_speed"].expand_as(gap).clone()
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            ratio = (driver["min_gap"] + middle * driver["time_gap"]) / gap.clamp(0.1, FAR)
-            free = 1.0 - (middle / driver["desired_speed"]) ** exponent > ratio * ratio
-            low, high = torch.where(free, middle, low), torch.where(free, high, middle)
-        return 0.5 * (low + high)
 
 
 class OfFiveParameters(CarFollowing):

@@ -63,11 +63,6 @@ def errors(problem: Problem, own: Tensor, shared: Tensor) -> tuple[Errors, Simul
     )
 
 
-def like(problem: Problem, other: Problem) -> Problem:
-    """Return ``problem`` with the batch and groups of ``other``."""
-    return dataclasses.replace(problem, batch=other.batch, group=other.group, groups=other.groups)
-
-
 def pooled_errors(problem: Problem, own: Tensor, shared: Tensor, items: Sequence[Episode]) -> Errors:
     """Return the errors on other episodes of values ``own`` [1, free] and ``shared`` that all drivers have."""
     batch = Batch.stack(items, substeps=problem.batch.substeps)

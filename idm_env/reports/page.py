@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Block:
-    """One piece of a page: heading, paragraph, list, lights, terms, figure, gallery, table or markup of one's own.
+    """One piece of a page: heading, paragraph, list, lights, figure, gallery, table or markup of one's own.
 
     ``narrow`` is the figure's picture for small screens, where it has one.
     """
@@ -114,11 +114,6 @@ def shortened(items: Sequence[str], most: int = 100) -> list[str]:
 def lights(rows: Iterable[tuple[str, str, str]]) -> Block:
     """Return one card per (name, ``better``, ``same`` or ``worse``, words); the state is a word and a colour, or ""."""
     return Block("lights", rows=tuple(rows))
-
-
-def terms(meanings: Mapping[str, str]) -> Block:
-    """Return the meanings of a table's terms, to stand under it."""
-    return Block("terms", rows=tuple(meanings.items()))
 
 
 def html(markup: str) -> Block:

@@ -14,8 +14,8 @@ from agents.environments import task_of
 from agents.evaluate import kinds, solved_at
 from agents.policy import Policy
 from agents.rollout import Driven, drive, ring_start, uniform_speed
-from idm_env.effects.idm import equilibrium_speed
 from idm_env.tasks import make_task
+from tests.equilibrium import equilibrium_speed
 
 RING: dict[str, Any] = {"task": "ring", "shock": 0.0}
 TASK = make_task(**RING)

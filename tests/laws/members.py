@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
@@ -93,3 +95,11 @@ def with_leaves(params: Params, effect: str) -> tuple[dict[str, dict[str, Tensor
     """Return params whose ``effect`` has leaf tensors, and those leaves."""
     leaves = {name: value.clone().requires_grad_() for name, value in params[effect].items()}
     return {**params, effect: leaves}, leaves  # type: ignore[dict-item]
+
+
+def at_null(effects: Iterable[Effect]) -> dict[str, dict[str, Tensor]]:
+    """Return defaults with every parameter that has a null set to it: each such effect is absent."""
+    return {
+        e.name: {p.name: torch.tensor(p.default if p.null is None else p.null, dtype=DTYPE) for p in e.parameters}
+        for e in effects
+    }

@@ -9,12 +9,11 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from idm_env import parameters
 from idm_env.effects import ALL, BASES, CANDIDATES, IDM, Brakes, CarFollowing, Effect, make
 from idm_env.roads import Lane, Lanes, Ring, Road
 from idm_env.simulator import Simulator
 from idm_env.types import Scene
-from tests.laws.members import DTYPE, MEMBERS, N, around, inputs_for, label, signalled, start, with_leaves
+from tests.laws.members import DTYPE, MEMBERS, N, around, at_null, inputs_for, label, signalled, start, with_leaves
 
 everything = pytest.mark.parametrize("effect", MEMBERS, ids=label)
 NULLABLE = [e for e in MEMBERS if any(p.null is not None for p in e.parameters)]
@@ -64,7 +63,7 @@ def test_null_is_absent(effect: Effect, road: Lane | Ring, integration: str) -> 
     """At its null an effect leaves no trace, to the last bit."""
     with_it = around(effect, road, integration=integration)
     without = with_it.without(effect.name)
-    params = parameters.null(with_it.effects, dtype=DTYPE)
+    params = at_null(with_it.effects)
     inputs = inputs_for(with_it, 30, torch.zeros(N, dtype=DTYPE))
     _, one = with_it.rollout(start(with_it, params), inputs, params, 30)
     _, other = without.rollout(start(without, params), {}, params, 30)
@@ -78,7 +77,7 @@ def test_null_is_absent(effect: Effect, road: Lane | Ring, integration: str) -> 
 def test_a_strength_has_a_gradient_at_its_null(effect: Effect) -> None:
     """What has no gradient at its null can never be found there: such parameters must say so by their role."""
     simulator = around(effect)
-    params, leaves = with_leaves(parameters.null(simulator.effects, dtype=DTYPE), effect.name)
+    params, leaves = with_leaves(at_null(simulator.effects), effect.name)
     inputs = inputs_for(simulator, 40, torch.zeros(N, dtype=DTYPE))
     _, kept = simulator.rollout(start(simulator, params), inputs, params, 40)
     kept.position[-1].square().sum().backward()
@@ -99,7 +98,7 @@ def test_an_effect_at_its_default_does_something(effect: Effect) -> None:
     simulator = around(effect)
     inputs = inputs_for(simulator, 60, torch.zeros(N, dtype=DTYPE))
     ends = []
-    for params in (simulator.defaults(dtype=DTYPE), parameters.null(simulator.effects, dtype=DTYPE)):
+    for params in (simulator.defaults(dtype=DTYPE), at_null(simulator.effects)):
         if effect.kind in ("power_limit", "traction"):  # what a car can is more than these drivers want
             (p,) = effect.parameters
             params[effect.name][p.name] = torch.tensor(p.null if ends else p.low, dtype=DTYPE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import numpy as np
@@ -115,3 +116,11 @@ def as_record(wanted: list[int]) -> bytes:
     for index in wanted:
         message.tracks_to_predict.add(track_index=index)
     return bytes(message.SerializeToString())
+
+
+def frame(data: bytes) -> bytes:
+    """Return one record of a TFRecord file."""
+    head = struct.pack("<Q", len(data))
+    return (
+        head + struct.pack("<I", womd_record.masked_crc(head)) + data + struct.pack("<I", womd_record.masked_crc(data))
+    )

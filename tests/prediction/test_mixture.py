@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.prediction import PRIOR_AGENTS, Seen, fit_shares, score_hits
 from idm_env.prediction.metrics import Case
-from idm_env.prediction.mixture import PRIOR_AGENTS, Seen, fit_shares, pace_of, score_hits, share_of
+from idm_env.prediction.mixture import pace_of, share_of
 
 STEPS = 80
 

@@ -18,7 +18,7 @@ from idm_env.prediction.drivers import Second, hypotheses, middle, posterior
 from idm_env.prediction.files import OURS, case_of, predict_files
 from idm_env.prediction.lanes import LaneGraph, Route
 from idm_env.prediction.metrics import score, summary
-from idm_env.prediction.mixture import SHARES, fit_shares
+from idm_env.prediction.mixture import SHARES
 from idm_env.prediction.predict import (
     METHODS,
     along_lane,
@@ -349,7 +349,7 @@ def test_held_out_no_kind_is_predicted_worse_than_by_constant_velocity(measured)
         for path in sorted(measured("womd_json").glob("*.json.gz"))
         for scenario in scenarios(path)
     ]
-    fitted = fit_shares(one.seen for scene in scenes for one in scene)
+    fitted = benchmark.fit_shares(one.seen for scene in scenes for one in scene)
     assert all(fitted[key] == pytest.approx(SHARES[key], abs=2e-3) for key in SHARES)
     agents = benchmark.held_out(scenes)
     groups = {(one.seen.kind, one.seen.pace) for one, _ in agents}

@@ -24,7 +24,7 @@ def write_json(path: Path, **choices: object) -> Path:
 
 
 def test_json_and_tfrecord_give_the_same_scene(tmp_path: Path) -> None:
-    (tmp_path / "fork.tfrecord").write_bytes(2 * womd_record.frame(scenes.as_record([0, 1])))
+    (tmp_path / "fork.tfrecord").write_bytes(2 * scenes.frame(scenes.as_record([0, 1])))
     with gzip.open(tmp_path / "fork.json.gz", "wt") as file:
         json.dump(scenes.as_json([0, 1], signal=True), file)
     (one,) = scenarios(tmp_path / "fork.json.gz")
@@ -56,7 +56,7 @@ def test_older_files_without_metadata_predict_everybody(tmp_path: Path) -> None:
 
 
 def test_a_truncated_record_is_named_after_the_whole_ones(tmp_path: Path) -> None:
-    data = womd_record.frame(scenes.as_record([0]))
+    data = scenes.frame(scenes.as_record([0]))
     for cut, message in ((-10, "truncated in record 1"), (-len(data) + 5, "truncated in the header of record 1")):
         path = tmp_path / "cut.tfrecord"
         path.write_bytes((data + data)[:cut])
@@ -68,12 +68,12 @@ def test_a_truncated_record_is_named_after_the_whole_ones(tmp_path: Path) -> Non
 
 
 def test_damaged_files_are_named(tmp_path: Path) -> None:
-    data = bytearray(womd_record.frame(scenes.as_record([0])))
+    data = bytearray(scenes.frame(scenes.as_record([0])))
     data[100] ^= 1
     cases: dict[str, tuple[bytes, str]] = {
         "bits.tfrecord": (bytes(data), "data of record 0 are damaged"),
         "text.tfrecord": (b"this is no record at all", "header of record 0 is damaged"),
-        "other.tfrecord": (womd_record.frame(b"\xff\xff\xff"), "no scenario.proto"),
+        "other.tfrecord": (scenes.frame(b"\xff\xff\xff"), "no scenario.proto"),
         "half.json": (b'{"objects": [', "cannot be read"),
         "empty.json": (b"{}", "has no 'objects'"),
         "wrong.json": (b'{"objects": [{"valid": [true]}]}', "lacks what a scenario needs"),

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from idm_env import metrics
-from idm_env.effects.idm import equilibrium_speed
+from tests.equilibrium import equilibrium_speed
 
 
 def test_fuel_is_the_published_polynomial():

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from idm_env.effects.idm import equilibrium_speed
 from idm_env.tasks import Draw, make_task
+from tests.equilibrium import equilibrium_speed
 
 
 def start(task, count=1, seed=0, dtype=torch.float64):

@@ -49,9 +49,9 @@ def test_reconstruct_with_holes_and_missing_rows(tmp_path: Path) -> None:
 
 
 def test_predict_does_the_whole_records_of_a_truncated_file(tmp_path: Path) -> None:
-    womd_record = pytest.importorskip("idm_env.data.womd_record")
+    pytest.importorskip("idm_env.data.womd_record")
     pytest.importorskip("google.protobuf", reason="protobuf is not installed")
-    record = womd_record.frame(scenes.as_record([0]))
+    record = scenes.frame(scenes.as_record([0]))
     (tmp_path / "cut.tfrecord").write_bytes(record + record[:-9])
     files = tmp_path / "cut.tfrecord", write_json(tmp_path / "old.json"), tmp_path / "missing.json"
     done = typed("predict", *files, "--out", tmp_path / "out")
