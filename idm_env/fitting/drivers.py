@@ -164,44 +164,25 @@ def failure(rows: list[dict[str, Any]], error: Errors) -> str:
     return f"The fit failed: {', and '.join(signs)}. {cure}" if signs else ""
 
 
-def blocks(estimates: Estimates, rows: Sequence[dict[str, Any]], shares: list[dict[str, Any]]) -> list[page.Block]:
-    """Return the table of parameters with their shares at bounds, and the table of drivers.
-
-    ``rows`` are those of the first ``MOST_ROWS`` drivers at least.
-    """
+def parameters(shares: list[dict[str, Any]]) -> page.Block:
+    """Return the table of parameters with their shares at bounds, of rows of ``bounds``."""
 
     def share(count: int, groups: int) -> page.Cell:
         return page.Cell(f"{count} ({100 * count / groups:.0f} %)" if count else "0", count, 2 * count > groups)
 
-    parameters = [
-        {
-            "parameter": f"{row['symbol']} {row['parameter'].split('.')[1].replace('_', ' ')}",
-            "unit": row["unit"],
-            "median": row["median"],
-            "10 %": row["p10"],
-            "90 %": row["p90"],
-            f"on its lowest, of {row['groups']}": share(row["on_low"], row["groups"]),
-            "lowest": row["low"],
-            f"on its highest, of {row['groups']}": share(row["on_high"], row["groups"]),
-            "highest": row["high"],
-            "not identified": share(row["not_identified"], row["groups"]),
-        }
-        for row in shares
-    ]
-    several = len(estimates.groups) > MOST_ROWS
-    listed = [_row(estimates, row) for row in rows[:MOST_ROWS]]
-    return [
-        page.table(parameters),
-        page.note("10 % and 90 %: so many of the groups lie below. Lowest and highest: where a parameter may lie."),
-        page.heading("One row per driver" if estimates.groups != ("all",) else "All drivers together"),
-        page.table(listed),
-        page.note(
-            "After ±: standard error, which allows for correlated residuals, not for a wrong model. ⊣: on its bound, "
-            "?: not identified by these data (standard error above half of the value). A click on a heading sorts. "
-            + (f"The first {MOST_ROWS} of {len(estimates.groups)} rows; all" if several else "The same rows")
-            + " are in drivers.csv."
-        ),
-    ]
+    rows = []
+    for row in shares:
+        name, n = f"{row['symbol']} {row['parameter'].split('.')[1].replace('_', ' ')}", row["groups"]
+        middle = {"unit": row["unit"], "median": row["median"], "10 %": row["p10"], "90 %": row["p90"]}
+        low = {f"on its lowest, of {n}": share(row["on_low"], n), "lowest": row["low"]}
+        high = {f"on its highest, of {n}": share(row["on_high"], n), "highest": row["high"]}
+        rows.append({"parameter": name, **middle, **low, **high, "not identified": share(row["not_identified"], n)})
+    return page.table(rows)
+
+
+def listed(estimates: Estimates, rows: Sequence[dict[str, Any]]) -> page.Block:
+    """Return the table of drivers; ``rows`` are those of the first ``MOST_ROWS`` drivers at least."""
+    return page.table([_row(estimates, row) for row in rows[:MOST_ROWS]])
 
 
 def _row(estimates: Estimates, row: dict[str, Any]) -> dict[str, Any]:

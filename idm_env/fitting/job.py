@@ -38,6 +38,8 @@ SIMULATED = ("simulated.parquet", "report.json", "report.html")
 NOISY_M, MOST_ROWS = 0.12, 50_000
 """Noise of a position above which a file is raw (m), and the rows that it is taken from. Of nine files of smoothed
 positions none is above 0.01, and NGSIM's raw ones are at 0.16."""
+TEMPLATES = Path(__file__).parent
+"""Where the words of pages stand."""
 MOST_DRIVERS = 10_000
 """Drivers that a model.yaml has of its own, at most; drivers.csv has all."""
 
@@ -201,7 +203,7 @@ def _write(
         save_model(out / "model.yaml", model)
     storage.write_json(out / "report.json", result)
     title = f"{estimates.simulator.base.title} fitted to {data['source']}"
-    page.write_page(out / "report.html", title, _fit_page(result, joined, table))
+    _write_fit_page(out / "report.html", title, result, joined, table)
     joined.parts.remove()
     return result
 
@@ -253,49 +255,14 @@ def model_of(found: Estimates, by: str = "driver") -> Model:
     )
 
 
-def _fit_page(result: dict[str, Any], joined: JoinedFit, table: list[dict[str, Any]]) -> list[page.Block]:
-    held, estimates = result["held_out"], joined.estimates
-    lead = (
-        f"{result['fit']['episodes']} episodes of {result['fit']['groups']} groups: mean gap RMSE "
-        f"{result['fit']['gap_rmse_m']:.2f} m, speed RMSE {result['fit']['speed_rmse_mps']:.2f} m/s, in free "
-        "simulation behind the measured leader."
-    )
-    if held is not None:
-        lead += f" On {held['episodes']} episodes of held-out {held['parts']}: {held['gap_rmse_m']:.2f} m."
+def _write_fit_page(
+    path: Path, title: str, result: dict[str, Any], joined: JoinedFit, table: list[dict[str, Any]]
+) -> None:
+    held = result["held_out"]
     rows = [{"": "fitted", **result["fit"]}] + ([] if held is None else [{"": f"held-out {held['parts']}", **held}])
-    figures = joined.pictures
-    several = [page.note(f"Pictures: the first of {len(joined.summaries)} parts.")] if joined.summaries[1:] else []
-    titles = ("Measured and simulated", "Residuals", "In space and time")
-    return [
-        *map(page.lead, filter(None, (result["failed"], lead, result["data"].get("noise"), result["over_fitting"]))),
-        page.text(result["at_bounds"]),
-        page.table(in_words(rows)),
-        page.note(
-            f"{result['fit']['converged']} of {result['fit']['groups']} groups converged. A value on its bound is not "
-            "an estimate: the data would have it beyond."
-        ),
-        *several,
-        *(block for title, one in zip(titles, figures, strict=False) for block in (page.heading(title), one)),
-        page.heading("Parameters"),
-        *([pictures.parameters(estimates)] if len(estimates.groups) > 1 else []),
-        *drivers.blocks(estimates, table, result["bounds"]),
-        *_data_section(result),
-    ]
-
-
-def _data_section(result: dict[str, Any]) -> list[page.Block]:
-    """Return what the data are, and what was repaired or left out."""
-    data = result["data"]
-    size = (
-        f"{data['source']}: {data['rows']} rows, {data['vehicles']} vehicles in {data['runs']} runs, "
-        f"{data['followers']} followers, {data['episodes']} episodes."
-    )
-    return [
-        page.heading("Data"),
-        page.text(size),
-        page.text(data["account"]),
-        page.bullets([*(r["text"] for r in data["repairs"]), *data["left_out"]]),
-    ]
+    figures = list(zip(("Measured and simulated", "Residuals", "In space and time"), joined.pictures, strict=False))
+    names: dict[str, Any] = {"r": result, "rows": in_words(rows), "figures": figures, "joined": joined, "table": table}
+    page.write_page(path, title, template=TEMPLATES / "fit.html", drivers=drivers, pictures=pictures, **names)
 
 
 def _overlap(model: Model, overlap: dict[Track, str] | None, items: Episodes, error: Errors) -> dict[str, Any]:
@@ -377,20 +344,9 @@ def _simulate_file(
         "versions": page.versions(),
     }
     storage.write_json(out / "report.json", result)
-    blocks = [
-        page.lead(
-            f"{len(items)} episodes simulated behind their measured leaders: mean gap RMSE "
-            f"{error.summary()['gap_rmse_m']:.2f} m, {result['fitted_on']['words']} {result['drivers']}"
-        ),
-        page.table(in_words([error.summary()])),
-        pictures.examples(problem, error, simulated),
-        page.heading("Residuals"),
-        pictures.residuals(problem, simulated),
-        page.heading("In space and time"),
-        *pictures.space_time(problem, simulated),
-        *_data_section(result),
-    ]
-    page.write_page(out / "report.html", f"{Path(name).name} behind the leaders of {source.path.name}", blocks)
+    names: dict[str, Any] = {"r": result, "rows": in_words([error.summary()]), "shown": (problem, error, simulated)}
+    title = f"{Path(name).name} behind the leaders of {source.path.name}"
+    page.write_page(out / "report.html", title, template=TEMPLATES / "simulate.html", pictures=pictures, **names)
     return result
 
 

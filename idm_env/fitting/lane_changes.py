@@ -161,7 +161,8 @@ def fit_lane_changes(
         result = _result(fit, trajectories, options)
         save_model(out / "model.yaml", fit.model)
         storage.write_json(out / "report.json", result)
-        page.write_page(out / "report.html", f"Lane changes of {trajectories.source}", _page(fit, result))
+        template, title = Path(__file__).with_suffix(".html"), f"Lane changes of {trajectories.source}"
+        page.write_page(out / "report.html", title, template=template, r=result, picture=_calibration_picture(fit))
         return result
 
 
@@ -201,37 +202,6 @@ def _sentence(fit: LaneChanges, compared: list[dict[str, Any]]) -> str:
         f"{decisions.changes} lane changes in {len(decisions)} decisions. On drivers whom the fit has not seen, by "
         f"log-likelihood, MOBIL is {' and '.join(verdicts)}.{doubt}{few}"
     )
-
-
-def _page(fit: LaneChanges, result: dict[str, Any]) -> list[page.Block]:
-    names = {
-        "model": "model", "parameters": "parameters", "fitted": "log-likelihood, fitted",
-        "held_out": "log-likelihood, held out", "mobil_gains": "MOBIL gains", "standard_error": "± (over drivers)",
-        "expected_changes": "changes expected",
-    }  # fmt: skip
-    return [
-        page.lead(result["sentence"]),
-        page.heading("Parameters"),
-        page.table(result["parameters"]),
-        page.note(
-            "P(change to a side) = λ/2 + (1 − λ) r Q, Q ∝ exp(h/τ) σ(m/τ): utility h and safety margin m as the "
-            "simulator computes them. Standard errors are the larger of the curvature's and of what drivers "
-            "differ by. What is on its bound, or has an interval wider than half of its bounds, is not identified. "
-            "A simulator with these parameters changes where h > 0 and m ≥ 0, at every decision: it knows no r, τ or λ."
-        ),
-        page.heading("Drivers that were held out"),
-        page.table([{title: row[name] for name, title in names.items()} for row in result["models"]]),
-        _calibration_picture(fit),
-        page.table(result["calibration"]),
-        page.heading("Data"),
-        page.text(
-            f"{result['decisions']['count']} decisions of {result['decisions']['vehicles']} vehicles, one every "
-            f"{result['options']['every']:g} s: {result['decisions']['left']} changes to the left, "
-            f"{result['decisions']['right']} to the right. Decisions without any room beside are not counted."
-        ),
-        page.text(result["data"]["account"]),
-        page.bullets([*(r["text"] for r in result["data"]["repairs"]), *result["data"]["left_out"]]),
-    ]
 
 
 def _calibration_picture(fit: LaneChanges) -> page.Block:

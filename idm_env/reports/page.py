@@ -175,6 +175,7 @@ def write_page(
         loader=FileSystemLoader([here.parent, template.parent]),
     )  # fmt: skip
     environment.filters |= filters or {}
+    environment.globals["table_of"] = table
     page = environment.get_template(template.name).render(title=title, blocks=list(blocks), **content)
     write_text(path, page)
 
