@@ -10,6 +10,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.interpolate import interp1d
 
 from idm_env.discovery import words
 from idm_env.discovery.solve import projected
@@ -118,11 +119,12 @@ def dependences(ladder: Ladder | None) -> Figure | None:
 
 def _residual(d: Discovery) -> list[np.ndarray]:
     """Return the residual acceleration before and after [R, J]: how much more the driver gains in speed each second."""
-    problem = d.problem
+    problem, rows, dt = d.problem, d.problem.rows, d.problem.rows.records.dt
+    ends = dt * np.arange(d.responses.change.shape[1] + 1) * max(1, round(1.0 / dt))
     shown = []
     for s in (d.null, d.final)[: len(d.judgement.titles)]:
-        errors = problem.errors(s.theta[None], s.model, s.values[None])[0]
-        shown.append(-np.diff(errors[:, 1:-2:2], axis=1, prepend=0.0))
+        speed = np.pad(problem.errors(s.theta[None], s.model, s.values[None])[0, :, :-2], ((0, 0), (1, 0)))
+        shown.append(-np.diff(interp1d(dt * rows.every * np.arange(speed.shape[1]), speed)(ends), axis=1))
     return shown
 
 
@@ -133,17 +135,15 @@ def features(d: Discovery) -> Figure:
         for axis, (name, values) in zip(axes.ravel(), d.responses.coordinates.items(), strict=False):
             edges = np.unique(np.quantile(values, np.linspace(0.01, 0.99, 17)))
             index = np.digitize(values.ravel(), edges) - 1
-            centre, mean, error = [], [], []
+            points = []
             for b in range(len(edges) - 1):
                 mine = mend.ravel()[index == b]
                 if len(mine) > 5:
-                    centre.append(0.5 * (edges[b] + edges[b + 1]))
-                    mean.append(float(np.mean(mine)))
-                    error.append(2 * float(np.std(mine)) / np.sqrt(len(mine)))
-            axis.errorbar(centre, mean, error, color=colour, lw=1.1, marker=".", ms=4, label=label, capsize=0)
+                    centre, error = 0.5 * (edges[b] + edges[b + 1]), 2.0 * np.std(mine) / np.sqrt(len(mine))
+                    points.append((centre, np.mean(mine), error))
+            axis.errorbar(*np.reshape(points, (-1, 3)).T, color=colour, lw=1.1, marker=".", ms=4, label=label)
             axis.axhline(0, color=TRUTH, lw=0.5)
-            unit = FEATURES[name]
-            axis.set_xlabel(words.ALONG[name] + ("" if unit == "1" else f"\n({unit})"))
+            axis.set_xlabel(words.ALONG[name] + ("" if FEATURES[name] == "1" else f"\n({FEATURES[name]})"))
     figure.legend(handles=axes[0, 0].get_legend_handles_labels()[0], loc="outside upper left", ncols=2)
     figure.supylabel("residual (m/s²)", fontsize=9)
     return figure

@@ -100,6 +100,13 @@ def test_a_single_run_is_told_and_drawn(tmp_path: Path) -> None:
     assert write_report(found, tmp_path)["report.html"].exists()
 
 
+@pytest.mark.parametrize("dt", [0.04, 0.2])
+def test_a_report_is_drawn_at_every_time_step(dt: float, tmp_path: Path) -> None:
+    """Windows are of whole samples of about half a second, and not of whole seconds at every step."""
+    found = discover(data(None, runs=7, followers=1, seconds=30.0, dt=dt), effects=["drag"])
+    assert write_report(found, tmp_path)["report.html"].exists()
+
+
 def test_one_candidate_alone_may_be_asked_for() -> None:
     """The round after its addition has nothing left to try."""
     found = discover(data("leader_acceleration"), effects=["leader_acceleration"])
