@@ -68,7 +68,7 @@ lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
 
 bench: setup
-	$(BIN)/idm-env bench
+	$(BIN)/python -m benchmarks.bench
 
 # The site, into build/site: warnings are errors, and no network is needed once the libraries are there. GALLERY=0 shows the
 # examples without running them, as continuous integration does, whose tests run them all.

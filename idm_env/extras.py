@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 OF = {
-    **dict.fromkeys(("google", "jinja2", "matplotlib", "polars", "pyarrow", "rich", "scipy", "statsmodels",
+    **dict.fromkeys(("google", "jinja2", "matplotlib", "polars", "pyarrow", "rich", "scipy",
                      "typer", "yaml"), "data"),
     **dict.fromkeys(("llvmlite", "numba"), "kernels"),
     "pygame": "render", "ray": "ray", "stable_baselines3": "sb3",

@@ -161,15 +161,12 @@ def test_a_file_of_effects_that_ends_the_process_is_one_line(data: Path, tmp_pat
         ("reconstruct", "--dt", "nan"),
         ("plot", "--seconds", "nan"),
         ("demo", "--seed", "-3"),
-        ("bench", "--sizes", "nan"),
-        ("bench", "--sizes", "1e400"),
-        ("bench", "--rounds", "0"),
     ],
 )
 def test_a_bad_number_is_refused_by_the_name_of_its_flag(
     data: Path, tmp_path: Path, command: str, flag: str, value: str
 ) -> None:
-    given = () if command in ("demo", "bench") else (data,)
+    given = () if command == "demo" else (data,)
     more = ("--model", data) if command == "simulate" else ()
     line = refused(command, *given, *more, f"{flag}={value}", "--out", tmp_path / "out")
     assert line.startswith(f"error: {flag} = ") and not (tmp_path / "out").exists()

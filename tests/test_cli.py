@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import inspect
 import json
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -259,3 +262,26 @@ def test_explain_reads_effects_from_files(frame: pl.DataFrame, tmp_path: Path) -
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert [c["effect"] for c in report["candidates"]] == ["fatigue"] and "only" not in report["candidates"][0]["note"]
+
+
+@pytest.mark.parametrize(
+    ("words", "following"),
+    [
+        ("fit DATA --where run_id=1 --starts 1 --substeps 1", "explain DATA --where run_id=1"),
+        ("drift DATA", "simulate DATA --model OUT/model.yaml"),
+        ("simulate DATA --base idm", "drift DATA"),
+        ("filter DATA", "fit OUT/trajectories.parquet"),
+        ("explain DATA --where run_id=1", "plot DATA --where run_id=1"),  # one recording: there is no model
+    ],
+)
+def test_every_report_and_terminal_end_with_the_next_command(
+    words: str, following: str, frame: pl.DataFrame, tmp_path: Path
+) -> None:
+    data, out = tmp_path / "my file.csv", tmp_path / "a b"
+    frame.write_csv(data)
+    where = {"DATA": shlex.quote(str(data)), "OUT": shlex.quote(str(out))}
+    typed_words, wanted = (re.sub("DATA|OUT", lambda m: where[m[0]], text) for text in (words, following))
+    done = typed(*shlex.split(typed_words), "--out", out)
+    last = done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 0 and last == f"Next: idm-env {wanted}"
+    assert f"<pre>idm-env {wanted}</pre>" in html.unescape((out / "report.html").read_text())

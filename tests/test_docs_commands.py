@@ -51,7 +51,7 @@ def outside(words: list[str]) -> str | None:
     if words[1:3] in (["-m", "pip"], ["-m", "venv"]):
         return outside(words[2:]) if words[2] == "pip" else None
     file = ROOT / (words[2].replace(".", "/") + ".py" if words[1] == "-m" else words[1])
-    if not file.exists():
+    if not file.exists() and not (file := file.with_suffix("") / "__main__.py").exists():
         return f"no {file}"
     text = "".join(f.read_text() for f in (file, ROOT / "agents" / "common.py", ROOT / "benchmarks" / "__init__.py"))
     options = [w.partition("=")[0].removeprefix("--") for w in words if w.startswith("--")]

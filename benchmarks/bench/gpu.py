@@ -1,7 +1,7 @@
 """On a GPU: milliseconds per step of the compiled rollout, and of environments with ``output="torch"``.
 
-Run alone as ``python -m benchmarks.bench.gpu``; ``idm-env bench`` has it where there is a GPU. Times are those of CUDA
-events, the least of the rounds.
+Run alone as ``python -m benchmarks.bench.gpu``; ``python -m benchmarks.bench`` has it where there is a GPU. Times are
+those of CUDA events, the least of the rounds.
 """
 
 from __future__ import annotations

@@ -32,16 +32,13 @@ def show(title: str, rows: list[dict[str, Any]]) -> None:
     Console(**PLAIN).print(table)
 
 
-def methods(result: dict[str, Any]) -> None:
+def filtered(result: dict[str, Any]) -> None:
     """Print the errors of a filter or a reconstruction beside those of other methods."""
-    from idm_env.trajectories.report import COLUMNS
+    from idm_env.trajectories.report import methods, points
 
-    if result["left_out_points"]:
-        names = {"method": "method", "rmse_m": "RMSE (m)", "mae_m": "mean |error| (m)", "p95_m": "95 % below (m)"}
-        rows = [{title: row[name] for name, title in names.items()} for row in result["left_out_points"]]
-        show(f"{result['left_out_points'][0]['points']} points of the file that were left out", rows)
-    rows = [{"method": row["method"], **{title: row[key] for key, title, _ in COLUMNS}} for row in result["methods"]]
-    show("Methods on these data", rows)
+    if rows := result["left_out_points"]:
+        show(f"{rows[0]['points']} points of the file that were left out", points(rows))
+    show("Methods on these data", methods(result["methods"]))
 
 
 def _account(result: dict[str, Any]) -> str:
@@ -63,17 +60,14 @@ def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> Non
         undecided(result, out)
         return
     from idm_env.discovery.result import Ceilings, Weight
-    from idm_env.discovery.words import ERRORS, ceilings, laws, weight
+    from idm_env.discovery.words import ceilings, error_rows, laws, weight
     from idm_env.reports.undecided import FOUND
 
     console.print(Text.assemble("Verdict: ", (result["verdict"].replace("_", " "), "bold"), ". "), end="")
     console.print(result["sentence"], soft_wrap=True, highlight=False)
-    before, after = result["error"]["before"], (result["partial"] or result["error"])["after"]
+    before = result["error"]["before"]
     if before is not None:
-        show("Errors on the test set", [
-            _error_row(name, unit, before[key], after[key], models, result["helps"].get(key))
-            for key, (name, unit) in ERRORS.items()
-        ])  # fmt: skip
+        show("Errors on the test set", error_rows(result, models))
     if result["interval"]:
         console.print(result["interval"], style="dim", highlight=False)
     console.print(weight(Weight(**result["prior"])), style="dim", highlight=False)
@@ -89,22 +83,6 @@ def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> Non
     if (out / FOUND).is_file():
         console.print(f"{FOUND} is the shape as an effect, to be used and changed", highlight=False)
     finished(out, _account(result))
-
-
-def _error_row(
-    name: str, unit: str, before: float, after: float, models: tuple[str, ...], compared: dict[str, Any] | None
-) -> dict[str, Any]:
-    """Return one error of explain: that of every model, and whether the second's is better, the same or worse."""
-    from idm_env.discovery.words import percent
-
-    row: dict[str, Any] = {"error": f"{name} ({unit})"} | dict(zip(models, (before, after), strict=False))
-    if len(models) > 1:
-        has_interval = compared is not None and compared["high"] is not None
-        change = percent(after / before) if before else ""
-        interval = f"{percent(compared['low'])} to {percent(compared['high'])}" if compared and has_interval else ""
-        verdict = compared["verdict"] if compared else ""
-        row |= {"change": change, "95 % interval": interval, "verdict": verdict}
-    return row
 
 
 def citations(effects: dict[str, Any]) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import inspect
 import os
 import signal
@@ -18,6 +17,7 @@ from idm_env.cli.answers import console
 from idm_env.extras import needed
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, shown
+from idm_env.reports import page
 
 with needed("the command line"):
     import typer
@@ -29,11 +29,25 @@ class _Refusing(typer.core.TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         refusals.refuse(ctx.params)
+        page.ASKED.set(_typed_words(str(ctx.info_name), ctx.params))
         for name in options.FILES:
             if isinstance(ctx.params.get(name), list) and not ctx.params.get("each"):
                 _join(ctx.params, name)
         refusals.refuse_whole(ctx.params)
-        return super().invoke(ctx)
+        super().invoke(ctx)
+        if following := page.next_command(ctx.params.get("out", options.OUT)):
+            console.print(f"Next: {following}", soft_wrap=True, highlight=False)
+
+
+def _typed_words(command: str, params: dict[str, Any]) -> page.Asked:
+    """Return the command, its files and options of reading as a user typed them."""
+    files: Any = next((params[name] for name in options.FILES if params.get(name)), [])
+    how = ("layout", "columns", "ring_length", "place", "where")
+    values_of = {name: params[name] for name in how if params.get(name) not in (None, "auto")}
+    values = [(name, each) for name, value in values_of.items() for each in (value if name == "where" else [value])]
+    words = [(f"--{name.replace('_', '-')}", str(value)) for name, value in values]
+    command = "each" if params.get("each") else command
+    return page.Asked(command, tuple(map(str, files if isinstance(files, list) else [files])), tuple(words))
 
 
 def _join(params: dict[str, Any], name: str) -> None:
@@ -63,8 +77,6 @@ app = typer.Typer(
     "speed_mps, length_m and run_id are used where present. Ctrl-C keeps what is done: add `--resume` to go on.",
 )
 PICTURES = (".png", ".svg", ".pdf")
-CHECKOUT = Path(__file__).resolve().parents[2]
-"""Where this package lies: a checkout, or the libraries of an installation."""
 
 
 def _version(is_asked: bool) -> None:
@@ -230,13 +242,17 @@ def filter_(*, data: Path, job: options.JobOptions, tracks: options.TrackOptions
     Args:
         data: Trajectories: csv, parquet and others; several files or a folder: each is a run, but of parquet files.
     """
+    _filtered(data, job, tracks)
+
+
+def _filtered(data: Path, job: options.JobOptions, tracks: options.TrackOptions, **task: Any) -> None:
     with shown(console) as report:
         from idm_env.trajectories.files import filter_file
 
         _work_begins()
         with job.running(report) as run:
-            result = filter_file(data, job.out, **dataclasses.asdict(tracks), **run)
-    answers.methods(result)
+            result = filter_file(data, job.out, **dataclasses.asdict(tracks), **task, **run)
+    answers.filtered(result)
     answers.finished(job.out, result["account"])
 
 
@@ -255,14 +271,7 @@ def reconstruct(
         data: Trajectories: csv, parquet and others; several files or a folder: each is a run, but of parquet files.
         dt: Step of the dense trajectories (s).
     """
-    with shown(console) as report:
-        from idm_env.trajectories.files import reconstruct_file
-
-        _work_begins()
-        with job.running(report) as run:
-            result = reconstruct_file(data, job.out, **dataclasses.asdict(tracks), dt=dt, **run)
-    answers.methods(result)
-    answers.finished(job.out, result["account"])
+    _filtered(data, job, tracks, task="reconstruct", dt=dt)
 
 
 @app.command()
@@ -503,30 +512,24 @@ def drift(
 ) -> None:
     """Estimate how unsteady drivers are: which quantity wanders, by how much (sigma), with which memory time (tau).
 
-    Writes report.json, and model.yaml with drivers who drift, for simulate --model and as `effects` of environments.
+    Writes report.html, and model.yaml, the model that forecasts drivers kept back best, for simulate --model and as
+    `effects` of environments.
 
     Args:
         drivers: Drivers at most, evenly spread over the file.
     """
     with shown(console) as report:
-        from idm_env.drift.job import drift_file
+        from idm_env.drift.job import drift_file, tables
         from idm_env.fitting.options import Source
 
         _work_begins()
         source = Source(data, max_gap=max_gap, min_seconds=min_seconds, dt=dt, **dataclasses.asdict(file))
         with job.running(report) as run:
             result = drift_file(source, job.out, drivers=drivers, **run)
-    names = {"log_likelihood": "gain in log-likelihood", "tau_s": "tau (s)"}
-    rows = [{names.get(name, name): x for name, x in row.items()} for row in result["sorts"]]
-    answers.show("Every sort of drift against drivers who do not drift", rows)
-    if scores := result["kept_back"]["scores"]:
-        titles = {"model": "model", "ahead_s": "ahead (s)", "gap_rmse_m": "RMSE (m)", "gap_crps_m": "CRPS (m)",
-                  "in_90_percent": "in the 90 % band (%)"}  # fmt: skip
-        forecasts = [{title: row[name] for name, title in titles.items()} for row in scores]
-        answers.show(f"Forecasts of the gap of {result['kept_back']['drivers']} drivers kept back", forecasts)
     console.print(result["sentence"], soft_wrap=True, highlight=False)
-    console.print(result["data"]["account"], soft_wrap=True, highlight=False)
-    answers.written("Model", job.out / "model.yaml")
+    for title, rows in tables(result).items():
+        answers.show(title, rows)
+    answers.finished(job.out, result["data"]["account"])
 
 
 @app.command()
@@ -589,42 +592,6 @@ def doctor() -> None:
     answers.show("This machine", [{"what": f.what, "state": f.state, "found": f.told, "cure": f.cure} for f in results])
     if any(finding.state == "broken" for finding in results):
         raise typer.Exit(1)
-
-
-@app.command()
-def bench(
-    out: Path = options.OUT,
-    sizes: str = "2000,20000,200000,2000000",
-    rounds: Annotated[int, options.Limits(1, 1000)] = 5,
-    compiled: bool = True,
-    peers: bool = True,
-    verbose: bool = False,
-) -> None:
-    """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine.
-
-    Writes report.html and performance.json. It is a benchmark of the checkout, and no part of an installed wheel.
-
-    Args:
-        sizes: Numbers of vehicles, by comma.
-        rounds: Interleaved rounds; minimum and median are reported.
-        compiled: Include the step compiled by inductor.
-        peers: Include SUMO and HighwayEnv.
-        verbose: Say which path ran, and why.
-    """
-    if not (CHECKOUT / "benchmarks" / "bench").is_dir():
-        raise ValueError(f"{CHECKOUT} has no benchmarks/: bench needs a checkout. Clone it, then 'make bench'.")
-    numbers = [round(_number("--sizes", size, "no number of vehicles")) for size in sizes.split(",")]
-    with shown(console) as report:
-        sys.path.insert(0, str(CHECKOUT))
-        benchmark = importlib.import_module("benchmarks.bench")
-        _work_begins()
-        result = benchmark.run(
-            out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, on_progress=report,
-            say=console.print if verbose else None,
-        )  # fmt: skip
-    for title, rows, _ in benchmark.tables.of(result)[: len(numbers) + 2]:  # the rest is in the report
-        answers.show(title, rows)
-    answers.finished(out, benchmark.tables.absent(result))
 
 
 def _number(option: str, text: str, wrong: str) -> float:

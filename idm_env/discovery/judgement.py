@@ -135,6 +135,16 @@ class Judgement:
         law = self.null.model.catalogue.base.title
         return tuple(" with ".join([law, *([" and ".join(names)] if names else [])]) for names in lists)
 
+    @property
+    def results(self) -> dict[str, judge.Judged]:
+        """Errors by plain name: of the null, and of a better law or the model beside it; empty with too few runs."""
+        if self.before is None:
+            return {}
+        if self.law is not None:
+            return {self.titles[0]: self.before, self.law.title: self.law.errors}
+        several = (self.before, self.after) if self.after is not None else (self.before,)
+        return dict(zip(self.titles, several, strict=False))
+
     def names(self) -> dict[str, str]:
         """Return which model every file holds: the law alone, the model beside it, another law, those of kinds.
 

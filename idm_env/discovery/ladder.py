@@ -162,7 +162,7 @@ def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, f
     total = _rmse(models[own].ahead) ** 2
     taken = {
         "sensors": floor_m**2,
-        "added": total - _rmse(error) ** 2,
+        last: total - _rmse(error) ** 2,
         "structure without a name": structure.share * _rmse(error) ** 2,
         "drift": _rmse(error) ** 2 - _rmse(rest) ** 2,
     }
@@ -170,7 +170,7 @@ def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, f
     for name, square in taken.items():
         parts[name] = min(max(square / total, 0.0), room)
         room -= parts[name]
-    order = ("sensors", "drift", "added", "structure without a name")
+    order = ("sensors", "drift", *([] if last == own else [last]), "structure without a name")
     ahead = {name: judged.ahead for name, judged in models.items()} | left
     free_m = {name: judged.summary()["gap_rmse_m"] for name, judged in models.items()}
     ten_s_m = {name: _rmse(judged.further) for name, judged in models.items() if len(judged.further)}

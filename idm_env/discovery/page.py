@@ -43,7 +43,7 @@ def write(path: Path, d: Discovery) -> None:
         },
         r=r, law=law, titles=judgement.titles, cards=cards(r, law), d=d, draw=pictures,
         picture=pages.picture, error_names=words.ERRORS, most=words.MANY, shortened=pages.shortened,
-        results={} if judgement.before is None else {name: j.summary() for name, j, *_ in pictures.named(d)},
+        rows=words.error_rows(d.report, list(judgement.results)),
         declared={p.name: p for p in d.null.model.catalogue.own}, weight=words.weight(r.prior),
         ceilings="" if before is None
         else words.ceilings(r.ceilings, before["gap_rmse_m"], r.error.floor["gap_rmse_m"]),
@@ -95,11 +95,23 @@ def _ends(interval: tuple[float | None, float | None]) -> str:
     return " … ".join(percent(x, 2) for x in interval) if all(map(_is_finite, interval)) else "–"
 
 
+def _in_units(r: Result, key: str) -> str:
+    """Return an error before and after, in its unit; nothing where several laws come after."""
+    base = next((base for base in r.bases if base.title == r.models["model.yaml"]), None)
+    if base is None or r.error.before is None or r.fleet is not None:
+        return ""
+    return f"{number(r.error.before[key])} → {number(getattr(base, key))} {words.ERRORS[key][1]}, "
+
+
 def cards(r: Result, law: str) -> list[tuple[str, str, str]]:
     """Return the first screen's cards: how each error changed or, where nothing is compared, what is known instead."""
     if (better := _better(r)) is not None:
         return [
-            (words.ERRORS[key][0].capitalize(), a.verdict, f"{change(a.ratio)} ({changes(a, ' to ')})")
+            (
+                words.ERRORS[key][0].capitalize(),
+                a.verdict,
+                f"{_in_units(r, key)}{change(a.ratio)} ({changes(a, ' to ')})",
+            )
             for key, a in better.items()
         ]
     if r.helps:

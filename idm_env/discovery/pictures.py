@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from scipy.interpolate import interp1d
 
 from idm_env.discovery import words
+from idm_env.discovery.judge import halves
 from idm_env.discovery.solve import projected
 from idm_env.effects.free import FEATURES
 
@@ -152,38 +153,42 @@ def features(d: Discovery) -> Figure:
 def _trace(judged: Judged, follower: int) -> tuple[np.ndarray, ...]:
     """Return time, measured gap and simulated gap of all pieces of a follower's record.
 
-    Pieces are divided by NaN. The samples are those of every table.
+    Pieces are divided by NaN, and simulated gaps where the driver's parameters change. The samples are those of every
+    table.
     """
-    rows = judged.rows
+    rows, second = judged.rows, halves(judged.rows)
     pieces: list[np.ndarray] = []
     for i in np.flatnonzero(judged.follower[rows.record] == follower):
         valid = rows.valid[i]
         sample = rows.samples[i][valid]
         time = rows.records.column("time")[sample]
         piece = np.stack([time, rows.records.gap[sample], judged.gap[i][valid]])
+        change = np.flatnonzero(np.diff(second[i][valid])) + 1
+        piece = np.insert(piece, change, [*piece[:2, change], np.full(len(change), np.nan)], axis=1)
         pieces += [piece, np.array([[time[-1]], [np.nan], [np.nan]])]
     time, measured, simulated = np.concatenate(pieces, axis=1)
     return time - time[0], measured, simulated
 
 
+def tested(d: Discovery, judged: Judged | None) -> np.ndarray:
+    """Return the followers [F] of the runs of the test set by their error, the best first; none without a test set."""
+    if judged is None:
+        return np.zeros(0, int)
+    inside = [run in d.result.error.held_out_runs for run, _ in judged.followers]
+    seen = np.flatnonzero(np.isfinite(judged.gap_rmse) & inside)
+    return seen[np.argsort(judged.gap_rmse[seen])]
+
+
 def typical(d: Discovery) -> int | None:
-    """Return the follower of the test set whose error with IDM is the median one, or None where no run was kept."""
-    if d.judgement.before is None:
-        return None
-    error = d.judgement.before.gap_rmse
-    seen = np.flatnonzero(np.isfinite(error))
-    return int(seen[np.argsort(error[seen])][len(seen) // 2]) if len(seen) else None
+    """Return the follower of the test set whose error with the null is the median one, None where there is none."""
+    order = tested(d, d.judgement.before)
+    return int(order[len(order) // 2]) if len(order) else None
 
 
 def named(d: Discovery) -> list[tuple[str, Judged, str, str]]:
-    """Return name, result, colour and line style of the models compared, IDM first."""
-    judgement = d.judgement
-    assert judgement.before is not None
-    titles = judgement.titles
-    models = [(titles[0], judgement.before, BEFORE, "-")]
-    if judgement.compared is not None and judgement.after is not None:
-        models.append((titles[1], judgement.after, AFTER, "--"))
-    return models
+    """Return name, result, colour and line style of the models compared, the null first."""
+    looks = ((BEFORE, "-"), (AFTER, "--"))
+    return [(name, judged, *look) for (name, judged), look in zip(d.judgement.results.items(), looks, strict=False)]
 
 
 def first_screen(d: Discovery, size: tuple[float, float] = (9.0, 4.0)) -> Figure | None:
@@ -211,11 +216,10 @@ def first_screen(d: Discovery, size: tuple[float, float] = (9.0, 4.0)) -> Figure
 
 def gaps(d: Discovery) -> Figure | None:
     """Best, median and worst follower of the test set."""
-    if d.judgement.before is None:
-        return None
     models = named(d)
-    error = models[-1][1].gap_rmse
-    order = np.argsort(np.where(np.isfinite(error), error, np.inf))[: int(np.isfinite(error).sum())]
+    order = tested(d, models[-1][1] if models else None)
+    if not len(order):
+        return None
     picks = [order[0], order[len(order) // 2], order[-1]]
     figure, axes = plt.subplots(3, 1, layout="constrained", figsize=(9.0, 7.0))
     for axis, follower, title in zip(axes, picks, ("best", "median", "worst"), strict=True):

@@ -70,7 +70,7 @@ def explain(
         progress("writing the report", 0, 0, "")
         write_report(discovery, out)
     result: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
-    return result, discovery.judgement.titles
+    return result, tuple(discovery.judgement.results)
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,7 @@ class _Set:
     question: Question
     parts: Parts
     resume: bool
+    asked: page.Asked
 
     def __str__(self) -> str:
         return self.path.name
@@ -106,8 +107,9 @@ def explain_sets(
     with storage.results(out, SETS, paths):
         stamps = [(p, p.stat().st_size, p.stat().st_mtime_ns) if p.exists() else p for p in paths]
         parts = Parts(out / storage.UNFINISHED / "sets", storage.fingerprint(question, stamps), resume)
+        command = page.ASKED.get()
         sets = [
-            _Set(n, path.absolute(), out / name, question, parts, resume)
+            _Set(n, path.absolute(), out / name, question, parts, resume, command._replace(files=(str(path),)))
             for n, (path, name) in enumerate(zip(paths, names, strict=True)) if not parts.done(n)
         ]  # fmt: skip
         done = len(paths) - len(sets)
@@ -115,6 +117,7 @@ def explain_sets(
             done += 1
             progress("sets", done, len(paths), "")
         rows = parts.summaries()
+        page.ASKED.set(command)
         storage.write_csv(out / "sets.csv", pl.DataFrame(rows, infer_schema_length=None).select(COLUMNS))
         page.write_page(out / "report.html", f"{len(rows)} data sets", _page(rows))
         parts.remove()
@@ -122,6 +125,7 @@ def explain_sets(
 
 
 def _explain_set(one: _Set, on_progress: OnProgress) -> None:
+    page.ASKED.set(one.asked._replace(command="explain"))
     row: dict[str, Any] = dict.fromkeys(COLUMNS) | {"set": one.path.name, "folder": one.out.name}
     try:
         report, _ = explain(one.path, one.out, one.question, resume=one.resume, on_progress=on_progress)

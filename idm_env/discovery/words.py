@@ -358,7 +358,7 @@ def _changes(against: Mapping[str, Comparison]) -> str:
             )
             better.append(f"{ERRORS[key][0]}{follower} {percent(ratio)} (95 %: {percent(low)} to {percent(high)})")
     same = [ERRORS[key][0] for key, c in against.items() if c.outcome is ErrorChange.SAME]
-    return ", ".join(better) + (f"; {' and '.join(same)} the same beyond chance" if same else "")
+    return ", ".join(better) + (f"; {' and '.join(same)}: no significant difference" if same else "")
 
 
 def law_first(law: Law, null: str, drivers: Solution | None = None, note: str = "") -> str:
@@ -397,15 +397,11 @@ def _of_drivers(drivers: Solution) -> list[str]:
 
 
 def weight(prior: Weight) -> str:
-    """Say how much the population weighs for one driver, and what other weights would have done."""
-    tried = ", ".join(
-        f"{number(seconds)} s {number(error)} m" for seconds, error in zip(prior.tried_s, prior.gap_rmse_m, strict=True)
-    )
-    return (
-        f"Every driver's parameters are drawn towards the population's. How strongly was chosen before any effect was "
-        "tested, by the gap in free simulation of validation runs: errors within "
-        f"{number(prior.alike_s)} s count as one (tried: {tried})."
-    )
+    """Say how much the population weighs for one driver, and the gap's error in free simulation of validation runs."""
+    error = dict(zip(prior.tried_s, prior.gap_rmse_m, strict=True)).get(prior.alike_s)
+    chosen = f"{number(prior.alike_s)} s{'' if error is None else f' ({number(error)} m)'}"
+    shrunk = "Drivers' parameters are shrunk towards the population mean (empirical Bayes)"
+    return f"{shrunk}; strength chosen by validation, before any effect was tested: {chosen}."
 
 
 def ceilings(of: Ceilings, before_m: float | None, floor_m: float | None = None) -> str:
@@ -421,6 +417,29 @@ def ceilings(of: Ceilings, before_m: float | None, floor_m: float | None = None)
         parts.append(f"sensor noise alone leaves {number(floor_m, 2)} m")
     text = "; ".join(parts)
     return f"{text[:1].upper()}{text[1:]}." if text else ""
+
+
+def error_rows(report: Mapping[str, Any], titles: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the errors of ``report.json``, a row each: of the models ``titles``, and how the second's compare."""
+    before, better = report["error"]["before"], better_law(report)
+    after = better or (report["partial"] or report["error"])["after"]
+    helps = better["against"] if better else report["helps"]
+    rows = []
+    for key, (name, unit) in ERRORS.items() if before is not None else ():
+        row = {"error": f"{name} ({unit})", titles[0]: before[key]}
+        if titles[1:]:
+            outcome = helps.get(key, {"verdict": "–", "high": None})
+            interval = "–" if outcome["high"] is None else f"{percent(outcome['low'])} to {percent(outcome['high'])}"
+            change = percent(after[key] / before[key]) if before[key] else "–"
+            row |= {titles[1]: after[key], "change": change, "95 % interval": interval, "verdict": outcome["verdict"]}
+        rows.append(row)
+    return rows
+
+
+def better_law(report: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the row of ``report.json`` for the law that is its ``model.yaml``, where that is another one."""
+    best = report["models"].get("model.yaml")
+    return next((row for row in report["bases"] if row["title"] == best and row["against"]), None)
 
 
 def laws(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -21,9 +21,7 @@ from idm_env.jobs.progress import OnProgress, silent
 from idm_env.model_file import Model, Numbers, nested, save_model
 from idm_env.reports import page
 
-WRITTEN = ("model.yaml", "report.json")
-
-
+WRITTEN = ("model.yaml", "report.json", "report.html")
 UNKNOWN = 100.0
 """An interval that reaches so many times as far as its estimate is none."""
 DRIVERS = 60
@@ -48,7 +46,7 @@ def drift_file(
     executor: Executor | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
-    """Say how the drivers of a file drift, and return the report; write it and ``model.yaml``.
+    """Say how the drivers of a file drift, and return the report; write it, a page and ``model.yaml``.
 
     ``drivers`` are taken at most, evenly spread over the file; every fourth driver is kept back, and forecasts of those
     are scored. ``executor`` estimates the sorts. ``resume`` goes on with the estimates of an interrupted run.
@@ -91,6 +89,7 @@ def drift_file(
             "versions": page.versions(),
         }  # fmt: skip
         storage.write_json(out / "report.json", result)
+        page.write_page(out / "report.html", f"How the drivers of {trajectories.source} drift", _page(result))
         store.remove()
         return result
 
@@ -147,3 +146,33 @@ def _sorts(answer: Told) -> list[dict[str, Any]]:
             "note": f"not estimated: {why}" if why else "",
         })  # fmt: skip
     return rows
+
+
+def tables(report: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of a report under their names in words and units, by the title of their table."""
+    names = {"ahead_s": "ahead (s)", "gap_rmse_m": "RMSE (m)", "gap_crps_m": "CRPS (m)", "tau_s": "tau (s)"}
+    names |= {"in_90_percent": "in the 90 % band (%)", "sort": "variant", "log_likelihood": "gain in log-likelihood"}
+    both = {
+        f"Forecasts of the gap of {report['kept_back']['drivers']} drivers kept back": report["kept_back"]["scores"],
+        "Stochastic variants against the deterministic model": report["sorts"],
+    }
+    hidden = ("forecasts", "in_50_percent")
+    cells = {title: [{k: v for k, v in row.items() if k not in hidden} for row in rows] for title, rows in both.items()}
+    return {
+        title: [{names.get(k, k): v for k, v in row.items()} for row in rows] for title, rows in cells.items() if rows
+    }
+
+
+def _page(report: dict[str, Any]) -> list[page.Block]:
+    blocks = [page.lead(report["sentence"])]
+    if scores := report["kept_back"]["scores"]:
+        figure, ((axis,),) = page.figure(size=(7.0, 3.2))
+        for model in dict.fromkeys(row["model"] for row in scores):
+            rows = [row for row in scores if row["model"] == model]
+            axis.plot([r["ahead_s"] for r in rows], [r["gap_crps_m"] for r in rows], marker=".", label=model)
+        axis.set(xlabel="time ahead (s)", ylabel="CRPS of the gap (m)", ylim=(0.0, None))
+        axis.legend(frameon=False)
+        blocks.append(page.picture(figure, "Forecasts of drivers kept back: the lower, the better."))
+    for title, rows in tables(report).items():
+        blocks += [page.heading(title), page.table(rows)]
+    return [*blocks, page.heading("Data"), page.text(report["data"]["account"])]

@@ -141,8 +141,10 @@ def _noise(trajectories: Trajectories, path: Path) -> str:
     """Return that positions are raw and what to do first; nothing where their noise is below ``NOISY_M``."""
     tracks = [p["position_m"].to_numpy() for _, p in trajectories.table.head(MOST_ROWS).group_by(TRACK) if len(p) > 20]
     sigma = float(np.median([noise_sigma(track) for track in tracks])) if tracks else 0.0
-    words = f"Positions have noise of {sigma:.2f} m (one sample to the next): first idm-env filter {path}."
-    return words if sigma > NOISY_M else ""
+    if sigma <= NOISY_M:
+        return ""
+    page.ASKED.set(page.ASKED.get()._replace(command="raw"))
+    return f"Positions have noise of {sigma:.2f} m (one sample to the next): first idm-env filter {path}."
 
 
 def _fit_folder(work: _Work) -> dict[str, Any]:

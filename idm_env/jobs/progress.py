@@ -40,21 +40,14 @@ class _Bars:
     """Bars on a terminal."""
 
     def __init__(self, console: Console) -> None:
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
+        from rich import progress as rich
 
         columns = (
-            TextColumn("{task.description:<14}", markup=False), BarColumn(bar_width=24), MofNCompleteColumn(),
-            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
-            TextColumn("{task.fields[words]}", markup=False),
+            rich.TextColumn("{task.description:<14}", markup=False), rich.BarColumn(bar_width=24),
+            rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"), rich.TimeRemainingColumn(),
+            rich.TextColumn("{task.fields[words]}", markup=False),
         )  # fmt: skip
-        self._bars = Progress(*columns, console=console, speed_estimate_period=600.0)
+        self._bars = rich.Progress(*columns, console=console, speed_estimate_period=600.0)
         self._tasks: dict[str, Any] = {}
         self._running = ""
 

@@ -107,6 +107,15 @@ def rollout_panel(
     return Panel(f"{len(lines)} vehicles", tuple(lines), ring_length)
 
 
+def panels_of(data: Any, *, ring_length: float | None = None, **rollout: Any) -> list[Panel]:
+    """Return the panels of the ``data`` of ``space_time``; ``rollout`` are keywords of ``rollout_panel``."""
+    if isinstance(data, list):
+        return data
+    if hasattr(data, "position") and hasattr(data, "speed"):
+        return [rollout_panel(data, ring_length=ring_length, **rollout)]
+    return panels(data, ring_length=ring_length)
+
+
 def lane_panels(
     data: Any, lane: Any, present: Any, *, dt: float = 0.1, ring_length: float | None = None, marked: Sequence[int] = ()
 ) -> list[Panel]:
@@ -168,12 +177,7 @@ def space_time(
         ValueError: If the table lacks a column.
         ImportError: If matplotlib is missing, with the command that installs it.
     """
-    if isinstance(data, list):
-        pictures = data
-    elif hasattr(data, "position") and hasattr(data, "speed"):
-        pictures = [rollout_panel(data, dt=dt, row=row, ring_length=ring_length, marked=marked)]
-    else:
-        pictures = panels(data, ring_length=ring_length)
+    pictures = panels_of(data, dt=dt, row=row, ring_length=ring_length, marked=marked)
     figure = figure_of(pictures[:most], title, fastest)
     legible(figure)
     return figure

@@ -5,19 +5,52 @@ from __future__ import annotations
 import base64
 import io
 import platform
+import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from idm_env.extras import needed
 from idm_env.jobs.storage import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+_SIMULATE = "simulate {data} --model {out}/model.yaml"
+NEXT = {
+    "plot": "fit {data}", "filter": "fit {out}/trajectories.parquet", "reconstruct": "fit {out}/trajectories.parquet",
+    "fit": "explain {data}", "raw": "filter {data}", "explain": _SIMULATE, "each": "explain {data}",
+    "demo": _SIMULATE, "simulate": "drift {data}", "drift": _SIMULATE, "lost": "plot {data}",
+}  # fmt: skip
+"""Next command by command: "lost" of one without a model, "raw" of a fit to noisy positions."""
+
+
+class Asked(NamedTuple):
+    """Command line of a user: the command, its files, and the options of reading them."""
+
+    command: str
+    files: tuple[str, ...] = ()
+    options: tuple[tuple[str, str], ...] = ()
+
+
+_NOTHING = Asked("")
+ASKED: ContextVar[Asked] = ContextVar("ASKED", default=_NOTHING)
+
+
+def next_command(out: Path) -> str:
+    """Return the command line that goes on after the running one, which writes to ``out``; nothing without one."""
+    command, files, options = ASKED.get()
+    has_model = command not in ("fit", "explain", "demo", "drift") or (out / "model.yaml").exists()
+    line = NEXT.get(command if has_model else "lost", "")
+    unknown = {"filter": ("--place", "--where"), "plot": ("--place",)}.get(line.partition(" ")[0], ())
+    words = (word for option in options if option[0] not in unknown for word in option)
+    data = shlex.join([*(files or (f"{out}/platoon.csv",)), *words])
+    return f"idm-env {line.format(data=data, out=shlex.quote(str(out)))}" if line else ""
 
 
 @dataclass(frozen=True)
@@ -176,7 +209,9 @@ def write_page(
     )  # fmt: skip
     environment.filters |= filters or {}
     environment.globals["table_of"] = table
-    page = environment.get_template(template.name).render(title=title, blocks=list(blocks), **content)
+    page = environment.get_template(template.name).render(
+        title=title, blocks=list(blocks), following=next_command(path.parent), **content
+    )
     write_text(path, page)
 
 

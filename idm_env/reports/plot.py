@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from idm_env.extras import needed
-from idm_env.reports.diagrams import COLOURS, Panel, panels, place_label, rollout_panel
+from idm_env.reports.diagrams import COLOURS, Panel, panels_of, place_label
 
 
 def edie(drawn: Sequence[Panel], *, seconds: float = 60.0, metres: float = 100.0) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +61,7 @@ def fundamental_diagram(
     with needed("a diagram"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    density, flow = edie(_panels(data, dt, ring_length), seconds=seconds, metres=metres)
+    density, flow = edie(panels_of(data, dt=dt, ring_length=ring_length), seconds=seconds, metres=metres)
     figure = Figure(figsize=(6.0, 4.2), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
@@ -87,7 +87,7 @@ def animate(data: Any, *, dt: float = 0.1, ring_length: float | None = None, eve
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.colors import LinearSegmentedColormap
         from matplotlib.figure import Figure
-    panel = _panels(data, dt, ring_length)[0]
+    panel = panels_of(data, dt=dt, ring_length=ring_length)[0]
     ring = panel.ring_length
     figure = Figure(figsize=(5.0, 4.0) if ring else (8.0, 2.0), dpi=80, layout="constrained")
     FigureCanvasAgg(figure)
@@ -115,11 +115,3 @@ def animate(data: Any, *, dt: float = 0.1, ring_length: float | None = None, eve
         return (dots,)
 
     return FuncAnimation(figure, picture, frames=list(times), interval=100)
-
-
-def _panels(data: Any, dt: float, ring_length: float | None) -> list[Panel]:
-    if isinstance(data, list):
-        return data
-    if hasattr(data, "position") and hasattr(data, "speed"):
-        return [rollout_panel(data, dt=dt, ring_length=ring_length)]
-    return panels(data, ring_length=ring_length)

@@ -1,4 +1,4 @@
-"""The smoothers that ours is compared with: four of the paper and two that it left out.
+"""The smoothers that ours is compared with: four of the paper and one that it left out.
 
 Each is a function ``(time_s, position_m, clock) -> Motion`` of measured times and positions [N] (times rising, not
 necessarily regular) and the clock [K] on which the result is wanted; free numbers have the paper's defaults where it
@@ -8,7 +8,6 @@ states them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from importlib.util import find_spec
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -144,34 +143,6 @@ def _least_squares(matrix: np.ndarray, target: np.ndarray, inequality: np.ndarra
     return free + np.linalg.solve(r, -residual[:-1] / residual[-1])
 
 
-def kalman(
-    time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, density: float = 0.1, sigma: float = 0.3
-) -> RegularMotion:
-    """Return the Rauch–Tung–Striebel smoother of a constant-acceleration model with white noise (statsmodels).
-
-    ``density`` is the spectral density of the jerk (m²/s⁵) and ``sigma`` the noise of positions (m). Samples are taken
-    at the nearest tick of the clock. ImportError where statsmodels is not installed.
-    """
-    from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
-
-    dt = (clock[-1] - clock[0]) / (len(clock) - 1)
-    values = np.full(len(clock), np.nan)
-    values[np.clip(np.round((time_s - clock[0]) / dt).astype(int), 0, len(clock) - 1)] = position_m - position_m[0]
-    model = KalmanSmoother(k_endog=1, k_states=3)
-    model["transition"] = np.array([[1.0, dt, dt * dt / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
-    model["selection"] = np.eye(3)
-    model["state_cov"] = density * np.array(
-        [[dt**5 / 20, dt**4 / 8, dt**3 / 6], [dt**4 / 8, dt**3 / 3, dt**2 / 2], [dt**3 / 6, dt**2 / 2, dt]]
-    )
-    model["design"] = np.array([[1.0, 0.0, 0.0]])
-    model["obs_cov"] = np.array([[sigma * sigma]])
-    duration = max(time_s[-1] - time_s[0], dt)
-    model.initialize_known(np.array([0.0, (position_m[-1] - position_m[0]) / duration, 0.0]), np.diag([25.0, 100, 10]))
-    model.bind(values[:, None])
-    state = model.smooth().smoothed_state
-    return RegularMotion(clock, state[0] + position_m[0], state[1], state[2])
-
-
 Smoother = Callable[..., RegularMotion]
 Choice = Mapping[str, float]
 
@@ -183,14 +154,8 @@ BASELINES: dict[str, tuple[Smoother, tuple[Choice, ...]]] = {
     "Savitzky–Golay": (
         savitzky_golay, tuple({"window": w, "order": o} for o in (2, 3, 5) for w in range(31, 122, 10)),
     ),
-    "Kalman/RTS": (kalman, tuple({"density": q} for q in (0.01, 0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.3))),
 }  # fmt: skip
 """Name → function, and what a tuning tries of its free numbers."""
-
-
-def available() -> list[str]:
-    """Return the names of the baselines that can run here: Kalman/RTS needs statsmodels."""
-    return [name for name in BASELINES if name != "Kalman/RTS" or find_spec("statsmodels") is not None]
 
 
 def run(name: str, time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, **choice: float) -> RegularMotion:

@@ -76,7 +76,7 @@ def done(
 
     ``remarks`` are what else is to be known of it. ``on_stage`` is called with the share done and what comes next.
     """
-    others = baselines.available() if settings.baselines else ()
+    others = baselines.BASELINES if settings.baselines else ()
     stages = 2 + len(others)
     on_stage(0.0, "filtering")
     tallies: dict[str, Tally] = {}

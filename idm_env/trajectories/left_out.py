@@ -39,7 +39,7 @@ def score(spool: Spool, plan: FilePlan, settings: FilterSettings) -> list[dict[s
     else:
         ours = [f.motion for f in recipe(list(halves), plan.dt, plan.noise, plan.options)]
     motions = {OURS[settings.recipe]: ours}
-    for name in baselines.available() if settings.baselines else ():
+    for name in baselines.BASELINES if settings.baselines else ():
         motions[name] = [baselines.run(name, t.time_s, t.position_m, clock_of(t, plan.dt)) for t in halves]
     spacing = float(np.median(np.concatenate([np.diff(t.time_s) for t in halves])))
     return [_row(name, motion, tracks, out, spacing) for name, motion in motions.items()]

@@ -24,6 +24,7 @@ COLUMNS = (
     ("implausible_percent", "tracks with |a| > 10 m/s² anywhere (%)", 1),
     ("milliseconds_per_trajectory", "time per trajectory (ms)", 2),
 )
+DIGITS = {title: digits for _, title, digits in COLUMNS}
 MOST_LISTED = 100
 
 
@@ -31,7 +32,7 @@ def write_report(
     out: Path, report: dict[str, Any], shown: Sequence[tuple[TrackPiece, RegularMotion]], parameters: pl.DataFrame,
     figures: Sequence[page.Block] = (),
 ) -> None:  # fmt: skip
-    """Write ``report.json`` and ``report.html`` with the table of methods, pictures before and after, and histograms.
+    """Write ``report.json`` and ``report.html`` with the table of methods, and pictures before and after.
 
     ``figures`` are pictures in space and time.
 
@@ -46,7 +47,7 @@ def write_report(
         blocks += _left_out_points(report["left_out_points"])
     if figures:
         blocks += [page.heading("In space and time"), *figures]
-    blocks += [page.heading("Methods on these data"), methods(report["methods"])]
+    blocks += [page.heading("Methods on these data"), page.table(methods(report["methods"]), digits=DIGITS, first=True)]
     words = "Position error rate: mean distance to the noisy data over the track's length; 0 for lines between samples."
     blocks.append(page.note(words))
     overlaps = report["overlapping_rows"]
@@ -83,13 +84,7 @@ def _left_out_points(rows: Sequence[dict[str, Any]]) -> list[page.Block]:
     words = f"Every second point of {ours['tracks']} tracks was left out, {ours['points']} in all, and reconstructed "
     words += f"from the others, {ours['spacing_s']:.3g} s apart: root mean square error {ours['rmse_m']:.2f} m"
     words += "" if line is None else f", straight lines {line['rmse_m']:.2f} m"
-    table = [
-        {
-            "method": row["method"], "RMSE (m)": row["rmse_m"], "mean |error| (m)": row["mae_m"],
-            "95 % of errors below (m)": row["p95_m"], "mean error (m)": row["bias_m"],
-        }
-        for row in rows
-    ]  # fmt: skip
+    table = points(rows)
     digits = dict.fromkeys(list(table[0])[1:], 2)
     return [
         page.heading("Points of the file that were left out"),
@@ -102,10 +97,15 @@ def _left_out_points(rows: Sequence[dict[str, Any]]) -> list[page.Block]:
     ]
 
 
-def methods(rows: Sequence[dict[str, Any]]) -> page.Block:
-    """Return the table of methods, ours first."""
-    table = [{"method": row["method"], **{title: row[key] for key, title, _ in COLUMNS}} for row in rows]
-    return page.table(table, digits={title: digits for _, title, digits in COLUMNS}, first=True)
+def points(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the errors of methods on points that were left out under their names in words."""
+    names = {"rmse_m": "RMSE (m)", "mae_m": "mean |error| (m)", "p95_m": "95 % below (m)", "bias_m": "mean error (m)"}
+    return [{"method": row["method"], **{title: row[key] for key, title in names.items()}} for row in rows]
+
+
+def methods(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the figures of methods, ours first, under their names in words."""
+    return [{"method": row["method"], **{title: row[key] for key, title, _ in COLUMNS}} for row in rows]
 
 
 def before_and_after(track: TrackPiece, motion: RegularMotion) -> Figure:
@@ -142,7 +142,7 @@ def before_and_after(track: TrackPiece, motion: RegularMotion) -> Figure:
 
 
 def _parameters(parameters: pl.DataFrame) -> list[page.Block]:
-    """Return the table and the histograms of the inferred parameters; nothing where there are none."""
+    """Return the table of the inferred parameters; nothing where there are none."""
     if "max_accel" not in parameters.columns or parameters["max_accel"].drop_nulls().is_empty():
         return []
     rows = []
@@ -155,28 +155,5 @@ def _parameters(parameters: pl.DataFrame) -> list[page.Block]:
             "quartiles": f"{low:.2f} – {high:.2f}",
             "identified": f"{100 * identified.to_numpy().mean():.0f} %" if len(identified) else "–",
         })  # fmt: skip
-    words = f"Driver parameters of {finite.height} tracks. Dark: identified, to within a half of the value."
-    return [
-        page.heading("Driver parameters"),
-        page.table(rows, digits={"median": 2}),
-        page.picture(parameter_histograms(parameters), words),
-    ]
-
-
-def parameter_histograms(parameters: pl.DataFrame) -> Figure:
-    """Return histograms of the inferred parameters, identified ones in blue."""
-    figure = Figure(figsize=(10, 2.6), layout="constrained")
-    for axis, p in zip(figure.subplots(1, 5), IDM.declared, strict=True):
-        values = parameters[p.name].drop_nulls().to_numpy()
-        bins = np.linspace(values.min(), max(values.max(), values.min() + 1e-6), 25)
-        axis.hist(values, bins, color=BEFORE, label="all")
-        identified = parameters.filter(pl.col(f"{p.name}_identified") & pl.col(p.name).is_not_null())[p.name].to_numpy()
-        if len(identified):
-            axis.hist(identified, bins, color=AFTER, label="identified")
-        axis.set_xlabel(f"{p.symbol}: {p.name.replace('_', ' ')} ({p.unit})", fontsize=9)
-        axis.tick_params(labelsize=8)
-    figure.axes[0].set_ylabel("tracks", fontsize=9)
-    shown = (zip(*axis.get_legend_handles_labels(), strict=True) for axis in figure.axes)
-    handles = {label: handle for pairs in shown for handle, label in pairs}
-    figure.legend(handles.values(), handles.keys(), loc="outside upper right", frameon=False, fontsize=9, ncols=2)
-    return figure
+    words = f"Of {finite.height} tracks. Identified: to within a half of the value."
+    return [page.heading("Driver parameters"), page.table(rows, digits={"median": 2}), page.note(words)]

@@ -19,7 +19,7 @@ def wave(clock: np.ndarray) -> RegularMotion:
     )
 
 
-@pytest.mark.parametrize("name", baselines.available())
+@pytest.mark.parametrize("name", baselines.BASELINES)
 def test_a_straight_line_is_kept_exactly(name: str) -> None:
     line = 5.0 + 10.0 * CLOCK
     motion = baselines.run(name, CLOCK, line, CLOCK)
@@ -28,7 +28,7 @@ def test_a_straight_line_is_kept_exactly(name: str) -> None:
     assert np.allclose(motion.accel_mps2, 0.0, atol=2e-2)
 
 
-@pytest.mark.parametrize("name", [name for name in baselines.available() if name != "linear"])
+@pytest.mark.parametrize("name", [name for name in baselines.BASELINES if name != "linear"])
 def test_every_smoother_beats_straight_lines_on_noise(name: str) -> None:
     rng = np.random.default_rng(0)
     truth = wave(CLOCK)
@@ -43,7 +43,7 @@ def test_every_smoother_beats_straight_lines_on_noise(name: str) -> None:
     assert errors[name]["accel_rmse_mps2"] < 0.5 * errors["linear"]["accel_rmse_mps2"]
 
 
-@pytest.mark.parametrize("name", baselines.available())
+@pytest.mark.parametrize("name", baselines.BASELINES)
 @pytest.mark.parametrize("count", [2, 3, 5])
 def test_short_tracks_have_a_motion(name: str, count: int) -> None:
     time = np.arange(count) * 1.0
@@ -71,11 +71,11 @@ def test_long_splines_are_blended_from_blocks() -> None:
 
 
 def test_kalman_agrees_with_the_exact_posterior_of_its_model() -> None:
-    pytest.importorskip("statsmodels")
+    kalman = pytest.importorskip("benchmarks.trajectories").kalman
     clock = np.arange(0, 3.05, 0.1)
     rng = np.random.default_rng(1)
     data = wave(clock).position_m + 0.3 * rng.normal(size=len(clock))
-    motion = baselines.kalman(clock, data, clock, density=0.3, sigma=0.3)
+    motion = kalman(clock, data, clock, density=0.3, sigma=0.3)
     # dense Gaussian: x(t) = x0 + v0 t + a0 t²/2 + ∫(t−s)² dW/2
     s, t = np.minimum.outer(clock, clock), np.maximum.outer(clock, clock)
     jerk = 0.3 * (s**5 / 20 + (t - s) * s**4 / 8 + (t - s) ** 2 * s**3 / 12)

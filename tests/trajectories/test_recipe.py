@@ -241,7 +241,7 @@ def test_it_beats_every_tuned_baseline_on_measured_vehicles(measured) -> None:  
     row = score(second, [f.motion for f in ours])
     assert row["implausible_percent"] == 0.0
     assert overlaps(ours)[1] == 0
-    for name in baselines.available():
+    for name in baselines.BASELINES:
         choices = baselines.BASELINES[name][1]
         rows = []
         for choice in choices:
