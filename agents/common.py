@@ -138,7 +138,7 @@ def command_line(train: Callable[[A], R], kind: type[A], agent: str, argv: Seque
     torch.set_num_threads(1)
     with one_line():
         arguments = parse(kind, agent, argv)
-        with storage.alone(arguments.out):
+        with storage.hold_folder(arguments.out):
             return train(arguments)
 
 

@@ -328,7 +328,7 @@ def check_places(path: str | Path, content: Mapping[Any, Any]) -> None:
         listed = isinstance(effects, Iterable) and not isinstance(effects, (str, Mapping))
         for one in effects if listed else ():  # type: ignore[union-attr]
             where = one.get("effect") if isinstance(one, Mapping) else one
-            if not isinstance(where, str) or ":" not in where or catalogue.imported(place := where.rpartition(":")[0]):
+            if not isinstance(where, str) or ":" not in where or catalogue.module_at(place := where.rpartition(":")[0]):
                 continue
             if not trust.permission():
                 raise ValueError(

@@ -81,7 +81,7 @@ def at_least(name: str, value: Any, low: float, unit: str = "", high: float = ma
     return number
 
 
-def within(name: str, value: Any, low: float, high: float, unit: str = "") -> float:
+def in_interval(name: str, value: Any, low: float, high: float, unit: str = "") -> float:
     """Return a number in ``[low, high]``; only a bound that is infinite lets an infinite number through.
 
     ValueError for any other.

@@ -117,7 +117,7 @@ def test_a_folder_that_cannot_be_used_is_one_line(disturbed: Disturbed, name: st
     loop, held = disturbed.folder / "loop", disturbed.folder / "held"
     if not loop.is_symlink():
         loop.symlink_to(loop)
-    with storage.alone(held):
+    with storage.hold_folder(held):
         for out, rule in (("loop/under", "loop"), ("held", "held is being written to by process")):
             if name == "plot" and out == "held":
                 continue

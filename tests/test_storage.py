@@ -303,7 +303,7 @@ def test_a_store_that_is_killed_while_it_is_made_or_removed_is_still_ours(tmp_pa
     with pytest.raises(KeyboardInterrupt):
         store.remove()
     monkeypatch.undo()
-    assert storage.Store(folder, "b", False).kept() == []
+    assert storage.Store(folder, "b", False).saved_names() == []
 
 
 def damaged(path: Path) -> dict[str, bytes]:

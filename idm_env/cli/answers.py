@@ -103,7 +103,7 @@ def end_failed(why: str) -> None:
         raise typer.Exit(1)
 
 
-def written(word: str, path: Path) -> None:
+def show_path(word: str, path: Path) -> None:
     """Say where a file lies, in full."""
     console.print(Text.assemble(f"{word}: ", (os.path.realpath(path), "bold")), soft_wrap=True)
 
@@ -111,4 +111,4 @@ def written(word: str, path: Path) -> None:
 def finished(out: Path, account: str) -> None:
     """Say what became of the data, and where the report lies."""
     console.print(account, soft_wrap=True, highlight=False)
-    written("Report", out / "report.html")
+    show_path("Report", out / "report.html")

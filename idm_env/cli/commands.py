@@ -211,7 +211,7 @@ def plot(
     if source.suffix not in (".yaml", ".yml"):
         console.print(account(repairs), soft_wrap=True, highlight=False)
     for path in written:
-        answers.written("Picture", path)
+        answers.show_path("Picture", path)
 
 
 def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress) -> list[Any]:
@@ -332,7 +332,7 @@ def fit(
     share: str | float | None = held_out
     if held_out is not None and "=" not in held_out:
         share = _number("--held-out", held_out, 'neither "column=value" nor a share such as 0.25')
-        validation.within("--held-out", share, 0.001, 0.999)
+        validation.in_interval("--held-out", share, 0.001, 0.999)
     with shown(console) as report:
         from idm_env.fitting import sumo as vtypes
         from idm_env.fitting.job import fit_file, in_words

@@ -39,7 +39,7 @@ class Limits(NamedTuple):
     def check(self, param: typer.CallbackParam, value: float | None) -> float | None:
         """Return the value; ValueError for one outside."""
         if value is not None:
-            validation.within(param.opts[0], value, *self)
+            validation.in_interval(param.opts[0], value, *self)
         return value
 
 

@@ -53,7 +53,7 @@ def episodes(
         if too_short:
             reasons += " Where samples are missing, idm-env reconstruct fills the holes."
         raise DataError(f"{trajectories.source}: no driver follows a leader for {min_seconds:g} s. {reasons}")
-    source = records.RecordColumns.of(trajectories, table, around)
+    source = records.RecordColumns.from_table(trajectories, table, around)
     numbers, texts = columns.extra(table)
     items = []
     count: dict[tuple[str, str], int] = {}

@@ -42,7 +42,9 @@ def marks(trajectories: Trajectories, drivers: Iterable[Track]) -> list[str]:
     return sorted(lines)
 
 
-def seen(trajectories: Trajectories, drivers: Iterable[Track], old_marks: Iterable[str]) -> dict[Track, str] | None:
+def names_by_mark(
+    trajectories: Trajectories, drivers: Iterable[Track], old_marks: Iterable[str]
+) -> dict[Track, str] | None:
     """Return, by driver, the name of the one of ``old_marks`` that his track has, whatever it is called here.
 
     Drivers without one are absent. None where no mark can be read: there is none, or another version wrote them.

@@ -140,7 +140,7 @@ def desired_accel(
     return accel
 
 
-def led(accel: np.ndarray, lead_accel: np.ndarray, on: dict[str, float]) -> np.ndarray:
+def with_feed_forward(accel: np.ndarray, lead_accel: np.ndarray, on: dict[str, float]) -> np.ndarray:
     """Return the acceleration with the reaction to the leader's own acceleration."""
     if "leader_acceleration" in on:
         accel = accel + on["leader_acceleration"] * lead_accel

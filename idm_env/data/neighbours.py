@@ -28,10 +28,10 @@ def find(table: pl.DataFrame) -> Neighbours:
     joined = rows.select(keys).join(targets, on=keys, how="left", maintain_order="left")
     leader = joined["found"].cast(pl.Int64).fill_null(NONE).to_numpy()
     second = np.where(leader >= 0, leader[leader], NONE)
-    return Neighbours(leader, second, _behind(leader, table["gap_m"].to_numpy()), _adjacent(rows, leader))
+    return Neighbours(leader, second, _followers_of(leader, table["gap_m"].to_numpy()), _adjacent(rows, leader))
 
 
-def _behind(leader: np.ndarray, gap: np.ndarray) -> np.ndarray:
+def _followers_of(leader: np.ndarray, gap: np.ndarray) -> np.ndarray:
     """Invert the leaders; of several followers of one vehicle the one with the smallest gap counts."""
     behind = np.full(len(leader), NONE)
     followers = np.flatnonzero(leader >= 0)

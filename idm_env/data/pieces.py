@@ -56,7 +56,7 @@ def split_runs(trajectories: Trajectories, seconds: float) -> Trajectories:
     begin = (pl.col("_piece") * seconds).round(3).cast(pl.String).str.strip_suffix(".0")
     pieces = pieces.with_columns(pl.format("{}@{}s", "run_id", begin).alias("run_id"))
     home = (
-        pieces.join(_chosen(trajectories), left_on=["_run", "vehicle_id"], right_on=schema.TRACK, how="semi")
+        pieces.join(_fitted_drivers(trajectories), left_on=["_run", "vehicle_id"], right_on=schema.TRACK, how="semi")
         .group_by("_run", "vehicle_id", "_piece", "run_id").len()
         .sort("_run", "vehicle_id", "len", "_piece", descending=[False, False, True, False])
         .unique(["_run", "vehicle_id"], keep="first", maintain_order=True)
@@ -98,6 +98,6 @@ def cure(trajectories: Trajectories) -> str | None:
     return f"The same vehicles stay in view, so cutting it would not help: record {LEAST_PIECES} runs or more."
 
 
-def _chosen(trajectories: Trajectories) -> pl.DataFrame:
+def _fitted_drivers(trajectories: Trajectories) -> pl.DataFrame:
     """Return run and vehicle of everybody who follows somebody and may be fitted."""
     return pl.DataFrame(trajectories.followers(), schema=dict.fromkeys(schema.TRACK, pl.String), orient="row")

@@ -109,7 +109,7 @@ class Platoon:
         result = np.empty_like(accel)
         ahead = self.leader.accel[k]
         for i in range(accel.shape[1]):
-            led_by = hidden.led(accel[:, i], ahead, self.on)
+            led_by = hidden.with_feed_forward(accel[:, i], ahead, self.on)
             result[:, i] = hidden.limited(led_by, speed[:, i], self._held[:, i], self.on)
             ahead = lagged[:, i] if "lag" in self.on else result[:, i]
         return result

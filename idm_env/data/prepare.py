@@ -46,32 +46,32 @@ def prepare(
     """
     done: list[Repair] = []
 
-    def then(result: tuple[pl.DataFrame, list[Repair]]) -> pl.DataFrame:
+    def keep_repairs(result: tuple[pl.DataFrame, list[Repair]]) -> pl.DataFrame:
         done.extend(result[1])
         return result[0]
 
     filled = clean.Filled()
-    frame = then(rows(frame, source, ring_length, filled))
+    frame = keep_repairs(rows(frame, source, ring_length, filled))
     filled.check(source)
-    frame = then(directions.one_way(frame, source))
+    frame = keep_repairs(directions.one_way(frame, source))
     count = frame.height
     frame, sorted_, twice = clean.ordered(frame)
     done += sorted_
     clean.check_recordings(twice, count, source)
     units.check(frame, source)
     jumps = plausible.Jumps()
-    frame = then(measured(frame, jumps))
+    frame = keep_repairs(measured(frame, jumps))
     jumps.check(source)
     frame = jumps.with_leaders(frame)
-    frame = then(clean.single_holes(frame))
+    frame = keep_repairs(clean.single_holes(frame))
     hidden = clean.hidden(frame)
-    frame = then(clean.without_position(frame))
+    frame = keep_repairs(clean.without_position(frame))
     steps = clock.steps_of(clock.paces(frame), frame["run_id"].unique(), source)
-    frame = then(clock.regularise(frame, steps))
-    frame = then(speeds.complete(frame, steps))
+    frame = keep_repairs(clock.regularise(frame, steps))
+    frame = keep_repairs(speeds.complete(frame, steps))
     hidden = clean.on_clock(hidden, frame, steps)
-    frame = then(leaders.steady(then(_led(_with_lane(frame), source, hidden, steps))))
-    frame = then(leaders.gaps(frame, source))
+    frame = keep_repairs(leaders.steady(keep_repairs(_with_leaders(_with_lane(frame), source, hidden, steps))))
+    frame = keep_repairs(leaders.gaps(frame, source))
     overlaps = plausible.Overlaps()
     overlaps.add(frame)
     done += overlaps.check(source, frame.select(schema.TRACK).n_unique())
@@ -80,7 +80,7 @@ def prepare(
     return schema.check(_arranged(frame), source), steps, done
 
 
-def _led(
+def _with_leaders(
     frame: pl.DataFrame, source: str, hidden: pl.DataFrame, steps: dict[str, float]
 ) -> tuple[pl.DataFrame, list[Repair]]:
     if "leader_id" in frame.columns:

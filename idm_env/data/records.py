@@ -53,7 +53,7 @@ class RecordColumns:
     step: np.ndarray
 
     @classmethod
-    def of(cls, trajectories: Trajectories, table: pl.DataFrame, around: Neighbours) -> RecordColumns:
+    def from_table(cls, trajectories: Trajectories, table: pl.DataFrame, around: Neighbours) -> RecordColumns:
         """Return the arrays of a table with ``step``, smoothing every track once for its acceleration."""
         position, speed = table["position_m"].to_numpy(), table["speed_mps"].to_numpy()
         step = table.select(of_run(trajectories.steps))["run_id"].to_numpy()

@@ -36,7 +36,7 @@ class Samples:
     length: np.ndarray
 
     @classmethod
-    def of(cls, episodes: Iterable[Episode]) -> Samples:
+    def from_episodes(cls, episodes: Iterable[Episode]) -> Samples:
         """Return the samples of episodes. DataError if there is none, or if they differ in their time step."""
         items = tuple(episodes)
         dt = time_step(items)

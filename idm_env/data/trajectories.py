@@ -114,7 +114,7 @@ class Trajectories:
         """
         if isinstance(held_out, str) and "=" in held_out:
             test = self.where(held_out)
-            return self._without(test), test
+            return self._others(test), test
         try:
             fraction = float(held_out)
         except ValueError:
@@ -165,7 +165,7 @@ class Trajectories:
         runs = {run for run, _ in drivers}
         return replace(self.of_runs([run for run in self.runs() if run in runs]), drivers=frozenset(drivers))
 
-    def _without(self, other: Trajectories) -> Trajectories:
+    def _others(self, other: Trajectories) -> Trajectories:
         if other.drivers is not None:
             rest: list = [driver for driver in self.followers() if driver not in other.drivers]
             make = self._of_drivers

@@ -44,7 +44,7 @@ def _kind(term: Term) -> str:
 
 
 def _class(term: Term, estimates: Mapping[str, ParameterEstimate]) -> dict[str, Any]:
-    """Return what the template takes of a curve."""
+    """Return the names and values of a curve that the template takes."""
     first, distance, count = term.drawn
     heights = ", ".join(("0.0 * x", *(f'p["{p.name}"]' for p in term.parameters), "0.0 * x"))
     factors = ", ".join(f"{n}=driver.{n} * (1.0 + c)" for n in TARGETS.get(term.what, ()))

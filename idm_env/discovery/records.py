@@ -111,7 +111,7 @@ def gather(
 
     ``trajectories`` tell how fast drivers went before their episodes began.
     """
-    samples = Samples.of(episodes)
+    samples = Samples.from_episodes(episodes)
     group, groups = group_of(episodes, by)
     runs = tuple(dict.fromkeys(e.run_id for e in episodes))
     before = _histories(episodes, trajectories)

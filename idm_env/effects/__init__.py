@@ -21,7 +21,7 @@ from idm_env.effects.neighbours import *
 from idm_env.effects.noise import *
 from idm_env.effects.perception import *
 from idm_env.effects.place_speeds import *
-from idm_env.effects.registry import entered, imported, is_candidate, lives, read
+from idm_env.effects.registry import enter, is_candidate, lives, module_at, read
 from idm_env.effects.road_rules import *
 from idm_env.effects.surroundings import *
 from idm_env.effects.time_gaps import *
@@ -62,7 +62,7 @@ def register(effect: type[Effect]) -> type[Effect]:
     Its name is then known to ``make``, to YAML and to discovery, which tries it like the package's candidates if a
     parameter has a null. ValueError if the name is taken.
     """
-    return entered(effect, ALL)
+    return enter(effect, ALL)
 
 
 def candidates() -> tuple[str, ...]:
@@ -130,5 +130,5 @@ def _fits(value: object, hint: Any) -> bool:
 
 __all__ = [
     "ALL", "BASES", "CANDIDATES", "DRIFTS", "CarFollowing", "Effect", "base_named", "candidates", "describe",
-    "imported", "make", "named", "register", "unspoken", *(effect.__name__ for effect in ALL.values()),
+    "make", "module_at", "named", "register", "unspoken", *(effect.__name__ for effect in ALL.values()),
 ]  # fmt: skip

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from idm_env.effects.base import Effect, P
-from idm_env.effects.places import along, smooth_step, window
+from idm_env.effects.places import on_lap, smooth_step, window
 from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
@@ -112,7 +112,7 @@ class SpeedZone(Effect):
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the desired speed in force."""
-        inside = window(along(scene.position, self.period), p["begin"], p["end"], self.width)
+        inside = window(on_lap(scene.position, self.period), p["begin"], p["end"], self.width)
         return driver._replace(desired_speed=driver.desired_speed * (1.0 + (p["factor"] - 1.0) * inside))
 
 

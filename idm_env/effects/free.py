@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from idm_env.effects.base import Effect, P
-from idm_env.effects.places import along, curve
+from idm_env.effects.places import curve, on_lap
 from idm_env.parameters import Parameter, nearest
 from idm_env.types import Driver, Scene
 
@@ -59,7 +59,7 @@ def feature_of(scene: Scene, driver: Driver, feature: str, period: float | None)
         "lead_accel": scene.leader.accel,
         "relative_gap": (scene.leader.gap / desired).clamp(0.0, FREE),
     }
-    return along(values[feature], period)
+    return on_lap(values[feature], period)
 
 
 def first_history(speed: Tensor, accel: Tensor, lead_accel: Tensor) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from idm_env.effects.base import Effect, P
-from idm_env.effects.places import along, curve, rising
+from idm_env.effects.places import curve, on_lap, rising
 from idm_env.effects.references import PUBLICATIONS
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
@@ -56,7 +56,7 @@ class SpeedProfile(Effect):
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the desired speed of this place."""
-        change = curve(along(scene.position, self.period), p, "change", self.knots, self.period)
+        change = curve(on_lap(scene.position, self.period), p, "change", self.knots, self.period)
         return driver._replace(desired_speed=driver.desired_speed * (1.0 + change).clamp_min(0.1))
 
 
@@ -97,7 +97,7 @@ class CurveSpeed(Effect):
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the desired speed that the bend leaves."""
-        place = along(scene.position, self.period)
+        place = on_lap(scene.position, self.period)
         bend: Tensor = curve(place, p, "curvature", self.knots, self.period, self.profile).abs()
         most = torch.sqrt(p["lateral_accel"] / bend.clamp_min(1e-6))
         return driver._replace(desired_speed=torch.minimum(driver.desired_speed, most))

@@ -22,7 +22,7 @@ def rising(name: str, knots: tuple[float, ...], profile: tuple[float, ...] | Non
         raise ValueError(f"{name}.profile has {len(profile)} values for {len(knots)} knots: give one each.")
 
 
-def along(position: Tensor, period: float | None) -> Tensor:
+def on_lap(position: Tensor, period: float | None) -> Tensor:
     """Return the position on a lap of length ``period`` (m), or the position itself on an open road."""
     return position if period is None else torch.remainder(position, period)
 

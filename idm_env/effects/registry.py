@@ -17,7 +17,7 @@ def same_class(a: type[Effect], b: type[Effect]) -> bool:
     return a is b or (a.__qualname__ == b.__qualname__ and _file(a) == _file(b))
 
 
-def entered(effect: type[Effect], catalogue: dict[str, type[Effect]]) -> type[Effect]:
+def enter(effect: type[Effect], catalogue: dict[str, type[Effect]]) -> type[Effect]:
     """Enter a class among the known ones.
 
     ValueError for one without a name, with another's, or that cannot be made without arguments.
@@ -70,7 +70,7 @@ def member(where: str, kind: str) -> tuple[ModuleType, object]:
     """
     place, _, name = where.rpartition(":")
     try:
-        module = imported(place) or (_module_of(Path(place)) if place.endswith(".py") else import_module(place))
+        module = module_at(place) or (_module_of(Path(place)) if place.endswith(".py") else import_module(place))
     except KeyboardInterrupt:
         raise
     except BaseException as error:
@@ -78,7 +78,7 @@ def member(where: str, kind: str) -> tuple[ModuleType, object]:
     return module, vars(module).get(name)  # a module's own __getattr__ may import
 
 
-def imported(place: str) -> ModuleType | None:
+def module_at(place: str) -> ModuleType | None:
     """Return the module of a place if this process has run it; nothing is run for that."""
     if not place.endswith(".py"):
         return sys.modules.get(place)

@@ -32,7 +32,7 @@ def _rows(kind: str, rows: Sequence[Sequence[float]], names: Sequence[str]) -> N
             raise ValueError(f"{kind} from {row[1]:g} m to {row[2]:g} m must end behind its beginning.")
 
 
-def _on(scene: Scene, lane: float) -> Tensor:
+def _is_on(scene: Scene, lane: float) -> Tensor:
     """Return who is on a lane (bool)."""
     assert scene.lane is not None
     return (scene.lane - lane).abs() < (0.5 if lane != EVERY_LANE else math.inf)
@@ -74,7 +74,7 @@ class SpeedLimit(Effect):
         """Return the driver with the desired speed that is left."""
         speed = driver.desired_speed
         for lane, begin, end, limit in self.zones:
-            here = _on(scene, lane) & (scene.position >= begin) & (scene.position < end)
+            here = _is_on(scene, lane) & (scene.position >= begin) & (scene.position < end)
             speed = torch.where(here, torch.clamp(speed, max=limit), speed)
         return driver._replace(desired_speed=driver.desired_speed + p["compliance"] * (speed - driver.desired_speed))
 
@@ -114,7 +114,7 @@ class LaneClosure(Effect):
     def _room(self, scene: Scene, inside: float) -> Tensor:
         room = torch.full_like(scene.position, FAR)
         for lane, begin, end, since, until in self.closures:
-            now = _on(scene, lane) & (scene.time >= since) & (scene.time < until)
+            now = _is_on(scene, lane) & (scene.time >= since) & (scene.time < until)
             ahead, between = scene.position <= begin, scene.position < end
             way = torch.where(ahead, begin - scene.position, torch.where(between, room * 0.0 + inside, FAR))
             room = torch.where(now, torch.minimum(room, way), room)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from idm_env.effects.base import Effect, P
-from idm_env.effects.places import along, curve, rising
+from idm_env.effects.places import curve, on_lap, rising
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
 
@@ -60,7 +60,7 @@ class Grade(Effect):
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return gravity's part (m/s²)."""
-        slope = curve(along(scene.position, self.period), p, "slope", self.knots, self.period, self.profile)
+        slope = curve(on_lap(scene.position, self.period), p, "slope", self.knots, self.period, self.profile)
         pull = -GRAVITY * slope / torch.sqrt(1.0 + slope * slope)
         return pull if self.profile is None else p["share"] * pull
 

@@ -57,7 +57,7 @@ class Batch:
 
         ``substeps`` None takes as many as ``INTEGRATION_STEP_S`` asks for.
         """
-        samples = Samples.of(episodes)
+        samples = Samples.from_episodes(episodes)
         begin, end, steps = samples.bounds[:-1], samples.bounds[1:], int(samples.lengths.max())
         index = np.minimum(begin + np.arange(steps)[:, None], end - 1)  # padded with its last sample
 

@@ -12,7 +12,7 @@ import polars as pl
 import torch
 
 from idm_env.data import DataError, Episode, Episodes, Repair, Trajectories, noise_sigma
-from idm_env.data.fingerprint import Track, marks, seen
+from idm_env.data.fingerprint import Track, marks, names_by_mark
 from idm_env.data.folder import FolderSlice, shares, stamp
 from idm_env.data.schema import TRACK
 from idm_env.effects import Brakes, base_named
@@ -326,7 +326,7 @@ def _simulate_file(
     trajectories = source.trajectories()
     items = source.episodes(trajectories)
     progress("simulating", 0, 0, f"{len(items)} episodes")
-    same = seen(trajectories, _drivers(items), model.fitted_on.get("tracks", ()))
+    same = names_by_mark(trajectories, _drivers(items), model.fitted_on.get("tracks", ()))
     problem, values, matched = problem_of(model, items, seed, same)
     with torch.no_grad():
         error, simulated = errors(problem, values, torch.zeros(0, dtype=values.dtype))

@@ -282,13 +282,13 @@ class Problem:
         def simulated(point: Tensor) -> Simulated:
             return self._rollout(dict(zip(values, point, strict=True)))
 
-        def along(direction: Tensor) -> tuple[Simulated, Simulated]:
+        def differentiate(direction: Tensor) -> tuple[Simulated, Simulated]:
             samples, tangents = torch.func.jvp(simulated, (point,), (direction,))[:2]
             return samples, tangents
 
         directions = one.expand(-1, *point.shape)
         # A tangent that is the same in all directions is put before its dimensions only: vmap fails at another place.
-        samples, tangents = torch.func.vmap(along, out_dims=(None, 0))(directions)  # type: ignore[arg-type]
+        samples, tangents = torch.func.vmap(differentiate, out_dims=(None, 0))(directions)  # type: ignore[arg-type]
         return self.residual(samples), self._weigh(*(x.movedim(0, 1) for x in tangents))
 
 

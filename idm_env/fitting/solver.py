@@ -107,10 +107,10 @@ class Progress:
 
 def normal(problem: LeastSquares, own: Tensor, shared: Tensor) -> Normal:
     """Linearise at these values; what is known of the own parameters is in it."""
-    return _with(problem.prior, problem.normal(own, shared), own)
+    return _add_prior(problem.prior, problem.normal(own, shared), own)
 
 
-def _with(prior: Known | None, data: Normal, own: Tensor) -> Normal:
+def _add_prior(prior: Known | None, data: Normal, own: Tensor) -> Normal:
     if prior is None:
         return data
     count = own.shape[-1]
@@ -178,20 +178,20 @@ def minimise(
         prior = None if prior is None else prior.following(progress.own)
         progress, data = (_together if together else _apart)(problem, prior, progress, data, tolerance)
         if on_step is not None:
-            on_step(progress, _with(prior, data, progress.own))
+            on_step(progress, _add_prior(prior, data, progress.own))
     prior = None if prior is None else prior.following(progress.own)
-    return progress, _with(prior, data, progress.own)
+    return progress, _add_prior(prior, data, progress.own)
 
 
 def _apart(
     problem: LeastSquares, prior: Known | None, progress: Progress, data: Normal, tolerance: float
 ) -> tuple[Progress, Normal]:
     """Try one step of every group's own parameters, which stands or falls by itself."""
-    own, now = progress.own, _with(prior, data, progress.own)
+    own, now = progress.own, _add_prior(prior, data, progress.own)
     trial = _own_tried(now, progress, problem.boxes[0])
     trial = torch.where(progress.done[..., None], own, trial)
     fresh = problem.normal(trial, progress.shared)
-    cost = _with(prior, fresh, trial).cost
+    cost = _add_prior(prior, fresh, trial).cost
     better = (cost < now.cost) & ~progress.done
     small = now.cost - cost <= tolerance * now.cost
     promised = -(now.gradient[..., : own.shape[-1]] * (trial - own)).sum(-1)
@@ -222,7 +222,7 @@ def _together(
 ) -> tuple[Progress, Normal]:
     """Try shares of one step of all parameters, and one of the own ones alone; keep what costs least in all."""
     own, shared, stiff = progress.own, progress.shared, problem.stiffness
-    now = _with(prior, data, own)
+    now = _add_prior(prior, data, own)
     own_only = _own_tried(now, progress, problem.boxes[0])
     trials = _shares(now, progress, own_only - own, stiff, problem.boxes)
     trial_shared = torch.cat((trials[1], shared))
@@ -266,7 +266,7 @@ def _judged(problem: LeastSquares, prior: Known | None, own: Tensor, shared: Ten
     trial, data = Progress.begin(own, shared, 1e-3), problem.normal(own, shared)
     for _ in range(FOLLOWING):
         trial, data = _apart(problem, prior, trial, data, 0.0)
-    return trial.own, _with(prior, data, trial.own).cost
+    return trial.own, _add_prior(prior, data, trial.own).cost
 
 
 def _shares(

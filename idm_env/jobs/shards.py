@@ -53,7 +53,7 @@ class Parts:
 
     def summaries(self) -> list[dict[str, Any]]:
         """Return the summaries of all parts, in their order."""
-        return [self.store.get_json(key)["summary"] for key in self.store.kept()]
+        return [self.store.get_json(key)["summary"] for key in self.store.saved_names()]
 
     def tables(self, name: str) -> list[Path]:
         """Return the files of all parts' tables of a name, in the order of the parts."""

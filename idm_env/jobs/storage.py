@@ -203,7 +203,7 @@ def results(out: str | Path, names: Sequence[str], inputs: Iterable[Path | str |
             raise ValueError(f"{folder} lies in {source}, whose files are all read. Give --out a folder elsewhere.")
     for name in names:
         not_an_input(folder / name, inputs)
-    with alone(folder):
+    with hold_folder(folder):
         mark = _mark(folder)
         if mark is None and os.path.lexists(folder / MARK):
             raise ValueError(f"{folder / MARK} is not one of {_OWNER}'s. Move it, or give --out another folder.")
@@ -229,7 +229,7 @@ def results(out: str | Path, names: Sequence[str], inputs: Iterable[Path | str |
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
+def hold_folder(folder: Path) -> Iterator[None]:
     """Hold a folder, which is made if missing, while this lasts; whoever holds it may do so again.
 
     The system lets go of the lock when its process ends, however that ends. Where there are no locks nothing is held.
@@ -379,7 +379,7 @@ class Store:
         """Return what was kept by ``put_json``, or None."""
         return self._get(key, json.loads)
 
-    def kept(self) -> list[str]:
+    def saved_names(self) -> list[str]:
         """Return the names under which contents are kept, sorted."""
         if self.folder is None:
             return sorted(self._memory)

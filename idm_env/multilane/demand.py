@@ -136,7 +136,7 @@ def turned(stepping: CarFollowingStep, state: State, params: Params, now: Tensor
     """Return the state after that, in all rows where it is ``now``."""
     if stepping.road.leaving:
         state = _departed(stepping, state, now)
-    return _entered(stepping, state, params, now)
+    return _enter(stepping, state, params, now)
 
 
 def _departed(stepping: CarFollowingStep, state: State, now: Tensor) -> State:
@@ -152,7 +152,7 @@ def _departed(stepping: CarFollowingStep, state: State, now: Tensor) -> State:
     return state._replace(present=stay, gap=torch.where(followed, state.gap, FAR), lanes=lanes)
 
 
-def _entered(stepping: CarFollowingStep, state: State, params: Params, now: Tensor) -> State:
+def _enter(stepping: CarFollowingStep, state: State, params: Params, now: Tensor) -> State:
     """Return the state after those have entered for whom it is time and who have room, one on each lane.
 
     Of a lane's queue the first enters at the beginning of the lane, where the gap s to the last vehicle there allows::
@@ -190,7 +190,7 @@ def _entered(stepping: CarFollowingStep, state: State, params: Params, now: Tens
     goes = some & (fast | fits(slow))
     if state.lanes.moving is not None:  # whoever is still leaving a lane is in the way there
         goes = goes & (_rear_of_leaving(state, lanes) - begins >= least + speed * time_gap)
-    return _placed(stepping, state, params, _Entry(goes, first, last, followed, begins, gap, speed))
+    return _put_on_road(stepping, state, params, _Entry(goes, first, last, followed, begins, gap, speed))
 
 
 def _rear_of_leaving(state: State, lanes: Tensor) -> Tensor:
@@ -234,7 +234,7 @@ def _last(state: State, lanes: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(mine, own, 0).amax(-1), mine.any(-1)
 
 
-def _placed(stepping: CarFollowingStep, state: State, params: Params, entry: _Entry) -> State:
+def _put_on_road(stepping: CarFollowingStep, state: State, params: Params, entry: _Entry) -> State:
     """Return the state with those on the road who enter."""
     assert state.present is not None and state.lanes is not None and state.lanes.trips is not None
     goes, first, last, followed, begins, gap, speed = entry

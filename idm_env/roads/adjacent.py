@@ -50,7 +50,7 @@ class Preference(NamedTuple):
     signals: Tensor
 
 
-def within(position: Tensor, length: Tensor, opens: Tensor, closes: Tensor) -> Tensor:
+def is_open_beside(position: Tensor, length: Tensor, opens: Tensor, closes: Tensor) -> Tensor:
     """Return whether a vehicle is, with all of its length, where a lane may be entered and left sideways (bool)."""
     return (position - length >= opens) & (position <= closes)
 

@@ -73,7 +73,7 @@ class Lanes(LaneLayout, Road):
                     f"vehicles of {float(taken.max()):g} m in all do not fit a lane of {self.ring:g} m. Take fewer "
                     "vehicles or a longer ring."
                 )
-        order = Order.of(position, lane, present, self.count, self.ring)
+        order = Order.built(position, lane, present, self.count, self.ring)
         none = torch.zeros_like(lane)
         return LaneState(lane, *order.links(), none, none, none, none)
 

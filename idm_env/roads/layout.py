@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from idm_env.roads.adjacent import within
+from idm_env.roads.adjacent import is_open_beside
 from idm_env.validation import at_least, one_of, whole
 
 ENDLESS = 1e9
@@ -140,5 +140,5 @@ class LaneLayout:
             return open_here
         for each in (lane, to.clamp(0, self.count - 1)):
             opens, closes = (self.at_lane(each, position, name) for name in ("opens", "closes"))
-            open_here = open_here & within(position, length, opens, closes)
+            open_here = open_here & is_open_beside(position, length, opens, closes)
         return open_here

@@ -167,7 +167,7 @@ class Linked(Sideways):
         """
         before, position = self.links_now, after.position
         lane = torch.where(lane >= 0, lane, before.lane)
-        leader, follower = Order.of(position, lane, after.present, self.road.count, self.road.ring).links()
+        leader, follower = Order.built(position, lane, after.present, self.road.count, self.road.ring).links()
         changed = lane != before.lane
         for mask in (state.present, after.present):
             changed = changed if mask is None else changed & (mask > 0)
@@ -211,7 +211,7 @@ class Linked(Sideways):
         if state.present is not None:
             leaving = leaving & (state.present > 0)
         origin, position = state.lanes.moving.origin, state.position
-        return Order.of(position, origin, leaving.to(position.dtype), self.road.count, self.road.ring)
+        return Order.built(position, origin, leaving.to(position.dtype), self.road.count, self.road.ring)
 
     def with_leaving(self, state: State, sides: tuple[Side, Side]) -> tuple[Side, Side]:
         """Return the lanes beside with those who are still leaving them, wherever they are nearer."""
@@ -263,7 +263,7 @@ class Linked(Sideways):
 
     def order(self, present: Tensor | None) -> Order:
         """Return the vehicles in order."""
-        return Order.of(self.position, self.links_now.lane, present, self.road.count, self.road.ring)
+        return Order.built(self.position, self.links_now.lane, present, self.road.count, self.road.ring)
 
     def to(self, step: int) -> Tensor:
         """Return the lane ``step`` to the left of every vehicle, its own where there is none."""
@@ -335,7 +335,7 @@ class Linked(Sideways):
         )
         if not worthwhile(claim.granted):
             return state._replace(lanes=links)
-        order = Order.of(self.position, claim.lane, state.present, self.road.count, self.road.ring)
+        order = Order.built(self.position, claim.lane, state.present, self.road.count, self.road.ring)
         # Where nobody changes lanes links stay what they are.
         some = claim.granted.any(-1, keepdim=True)
         before = self.links_now.leader, self.links_now.follower

@@ -38,7 +38,7 @@ class Order(NamedTuple):
     ring: float | None
 
     @classmethod
-    def of(cls, position: Tensor, lane: Tensor, present: Tensor | None, count: int, ring: float | None) -> Order:
+    def built(cls, position: Tensor, lane: Tensor, present: Tensor | None, count: int, ring: float | None) -> Order:
         """Return the order of vehicles at these positions (m), unwrapped on a ring."""
         place = places(position, ring)
         if present is not None:

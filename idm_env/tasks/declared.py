@@ -24,7 +24,7 @@ def one_declared(entry: object, kind: type[T], known: Mapping[str, T], where: st
             return known[entry]
         raise ValueError(f"{where}: {shown(entry)} is unknown.{nearest(str(entry), known)}")
     place = entry.rpartition(":")[0]
-    if registry.imported(place) is None and not trust.permission():
+    if registry.module_at(place) is None and not trust.permission():
         raise ValueError(
             f"{where}: {shown(entry)} is code of {shown(place)}, which is not run unasked. Read it, then give --trust, "
             f"trusted=True in Python, or {trust.VARIABLE}=1."

@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 
 from idm_env.data import Trajectories, load, synthetic
-from idm_env.data.fingerprint import fitted_on, seen
+from idm_env.data.fingerprint import fitted_on, names_by_mark
 
 
 def drivers(trajectories: Trajectories) -> list[tuple[str, str]]:
@@ -51,7 +51,7 @@ def test_the_same_drivers_at_the_same_times_are_known(
     marks = fitted_on(first, [driver for driver in drivers(first) if driver[0] in "12"])["tracks"]
     change(table).write_parquet(tmp_path / "other.parquet")
     again = load(tmp_path / "other.parquet")
-    known = seen(again, drivers(again), marks)
+    known = names_by_mark(again, drivers(again), marks)
     assert known and set(known) == {driver for driver in drivers(again) if driver[0][-1] in "12"} and len(known) == 6
 
 
@@ -61,9 +61,9 @@ def test_other_traffic_is_not_known(table: pl.DataFrame) -> None:
     other, _ = synthetic.generate(2, runs=4, followers=2, seconds=60.0)
     leaders = [driver for driver in drivers(first) if driver[1] == "1"]
     marks = fitted_on(first, leaders)["tracks"]
-    found = seen(first, drivers(first), marks)
+    found = names_by_mark(first, drivers(first), marks)
     assert found == {driver: "/".join(driver) for driver in leaders}
-    assert not seen(other, drivers(other), marks)
+    assert not names_by_mark(other, drivers(other), marks)
 
 
 def test_marks_stay_short_and_what_an_older_version_wrote_is_not_known() -> None:
@@ -71,4 +71,4 @@ def test_marks_stay_short_and_what_an_older_version_wrote_is_not_known() -> None
     drive, _ = synthetic.generate(1, runs=1, followers=1, seconds=400.0)
     (mark,) = fitted_on(drive, [("1", "2")])["tracks"]
     assert len(mark.split()) <= 66
-    assert seen(drive, drivers(drive), ["0123456789ab"]) is None
+    assert names_by_mark(drive, drivers(drive), ["0123456789ab"]) is None

@@ -21,7 +21,7 @@ def items() -> list[Episode]:
 
 
 def test_every_episode_is_there_in_order_with_everybody_around(items: list[Episode]) -> None:
-    samples = Samples.of(items)
+    samples = Samples.from_episodes(items)
     for r, episode in enumerate(items):
         here = slice(samples.bounds[r], samples.bounds[r + 1])
         assert np.array_equal(samples.gap[here], episode.gap_m) and np.array_equal(samples.time[here], episode.time_s)
@@ -47,4 +47,4 @@ def test_a_batch_and_the_records_of_discovery_show_the_same_samples(items: list[
 
 def test_no_episode_is_an_error() -> None:
     with pytest.raises(DataError, match="no episode"):
-        Samples.of([])
+        Samples.from_episodes([])

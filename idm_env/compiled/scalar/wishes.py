@@ -18,7 +18,7 @@ from idm_env.compiled.scalar.record import Form, Parameters, SeenRoad, inputs_of
 from idm_env.compiled.scalar.scalar import Scalar, Untraceable, value_of
 from idm_env.compiled.scalar.source import Constants, Write, body, function, row
 from idm_env.multilane.incentives import lane_scene, wished
-from idm_env.roads.adjacent import Preference, Side, Sideways, preferred, within
+from idm_env.roads.adjacent import Preference, Side, Sideways, is_open_beside, preferred
 from idm_env.roads.chains import Chains
 from idm_env.roads.lanes import Lanes
 from idm_env.step import CarFollowingStep
@@ -67,7 +67,7 @@ class _Sides(SeenRoad, Sideways):
         )
         exists = lane > 0
         for places in ((self.read("here opens"), self.read("here closes")), (opens, closes)):
-            exists = exists & within(state.position, state.length, *places)
+            exists = exists & is_open_beside(state.position, state.length, *places)
         return self.look(
             state, exists, Where(name, 1), Where(name, 0), ahead > 0, behind > 0, to_leader, to_follower,
             stops - state.position,
