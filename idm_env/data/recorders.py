@@ -32,8 +32,7 @@ def on_one_clock(trajectories: Trajectories) -> Trajectories:
 
     Times are shifted and put on the run's clock again. The counted repair says by how much clocks were apart.
     """
-    offsets = clock_offsets(trajectories)
-    if not offsets:
+    if not (offsets := clock_offsets(trajectories)):
         return trajectories
     shifts = pl.DataFrame([(*track, x) for track, x in offsets.items()], [*TRACK, "offset"], orient="row")
     table = trajectories.table.join(shifts, on=TRACK, how="left", maintain_order="left")
@@ -46,6 +45,7 @@ def on_one_clock(trajectories: Trajectories) -> Trajectories:
     return replace(trajectories, table=shifted.table, steps=shifted.steps, repairs=repairs)
 
 
+@np.errstate(invalid="ignore", divide="ignore")  # where all is equal nothing correlates, and nothing is shifted
 def clock_offsets(trajectories: Trajectories) -> dict[tuple[str, str], float]:
     """Return by (run, vehicle) how far clocks are ahead of that of the first car of a platoon (s); nothing for one."""
     counts = pl.DataFrame(trajectories.followers(), schema=TRACK, orient="row")["run_id"].value_counts()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import polars as pl
@@ -55,3 +56,23 @@ def test_nobody_behind_a_follower_tells_no_clock() -> None:
     measured = apart(platoons())
     few = replace(measured, table=measured.table.filter(pl.col("vehicle_id").is_in(["1", "2"])))
     assert clock_offsets(few) == {}
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_waves_in_which_every_shift_fits_alike_warn_of_nothing() -> None:
+    """All shifts end at the same bound then: they have no spread, and nothing correlates with them."""
+    time, cars, noise = np.arange(0.0, 30.0, 0.1), [], partial(np.random.default_rng(0).normal, 0.0, 0.05, 300)
+    for run in range(8):
+        lead = 15.0 + 4.0 * np.sin(time / 7.0 + run)
+        place = 200.0 + 0.1 * np.cumsum(lead)
+        for k in range(4):
+            names = {"run_id": [f"{run}"] * 300, "vehicle_id": [f"{k}"] * 300, "length_m": [5.0] * 300}
+            cars.append(pl.DataFrame({**names, "time_s": time, "position_m": place + noise(), "speed_mps": lead}))
+            x, v = [place[0] - 30.0], [15.0]
+            for ahead, faster in zip(place[:-1], lead[:-1], strict=True):
+                wish = 2.0 + max(0.0, 1.5 * v[-1] + v[-1] * (v[-1] - faster) / 3.4641)
+                accel = 1.5 * (1.0 - (v[-1] / 30.0) ** 4 - (wish / (ahead - x[-1] - 5.0)) ** 2)
+                v.append(v[-1] + 0.1 * accel)
+                x.append(x[-1] + 0.05 * (v[-1] + v[-2]))
+            place, lead = np.array(x), np.array(v)
+    assert clock_offsets(Trajectories.from_frame(pl.concat(cars))) == {}
