@@ -97,11 +97,6 @@ def note(words: str) -> Block:
     return Block("note", words)
 
 
-def bullets(items: Iterable[str]) -> Block:
-    """Return a list."""
-    return Block("list", rows=tuple(items))
-
-
 def table(
     rows: Sequence[Mapping[str, Any]],
     columns: Sequence[str] | None = None,

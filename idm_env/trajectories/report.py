@@ -40,61 +40,15 @@ def write_report(
     """
     storage.write_json(out / "report.json", report)
     how = "filtered" if report["settings"]["task"] == "filter" else "reconstructed"
-    blocks = [page.lead(_lead(report))]
-    if report["noise"]:
-        blocks.append(page.text(_noise(report["noise"])))
-    if report["left_out_points"]:
-        blocks += _left_out_points(report["left_out_points"])
-    if figures:
-        blocks += [page.heading("In space and time"), *figures]
-    blocks += [page.heading("Methods on these data"), page.table(methods(report["methods"]), digits=DIGITS, first=True)]
-    words = "Position error rate: mean distance to the noisy data over the track's length; 0 for lines between samples."
-    blocks.append(page.note(words))
-    overlaps = report["overlapping_rows"]
-    raw = overlaps - report["overlapping_rows_that_did_not_overlap_before"]
-    blocks.append(page.text(f"{overlaps} rows with a negative gap, {raw} of them in the raw data too."))
-    blocks += _parameters(parameters)
-    blocks.append(page.heading("Before and after"))
-    blocks += [page.picture(before_and_after(track, motion), f"Track {track.key}") for track, motion in shown]
-    blocks += [page.heading("Data"), page.text(report["account"])]
-    left_out = [f"{item['track']}: {item['reason']}" for item in report["left_out"]]
+    lost = [f"{item['track']}: {item['reason']}" for item in report["left_out"]]
     repaired = [item["text"] for item in report["repairs"]]
     repaired += [f"{item['vehicle']}: {item['note']}" for item in report["divided"]]
-    for title, items in (("Left out", left_out), ("Repaired", repaired)):
-        if items:
-            blocks += [page.heading(title), page.bullets(page.shortened(items, MOST_LISTED))]
-    page.write_page(out / "report.html", f"{report['source']}: {how} trajectories", blocks)
-
-
-def _lead(report: dict[str, Any]) -> str:
-    lost = len(report["left_out"])
-    words = f"{report['tracks']} tracks of {report['vehicles']} vehicles, one every {report['settings']['dt']} s."
-    return f"{words} {f'{lost} tracks were left out (below).' if lost else 'No track was left out.'}"
-
-
-def _noise(noise: dict[str, float]) -> str:
-    words = f"Fitted to this file: white noise {noise['white']:.3f} m, correlated noise {noise['sigma']:.3f} m over "
-    words += f"{noise['time']:.2f} s, jerk density {noise['jerk']:.3g} m²/s⁵"
-    return words + (f", accelerations fade in {noise['accel_time']:.2f} s." if noise["accel_time"] else ".")
-
-
-def _left_out_points(rows: Sequence[dict[str, Any]]) -> list[page.Block]:
-    """Return how far the methods are from points of the file that they were not given."""
-    ours, line = rows[0], next((row for row in rows if row["method"] == "linear"), None)
-    words = f"Every second point of {ours['tracks']} tracks was left out, {ours['points']} in all, and reconstructed "
-    words += f"from the others, {ours['spacing_s']:.3g} s apart: root mean square error {ours['rmse_m']:.2f} m"
-    words += "" if line is None else f", straight lines {line['rmse_m']:.2f} m"
-    table = points(rows)
-    digits = dict.fromkeys(list(table[0])[1:], 2)
-    return [
-        page.heading("Points of the file that were left out"),
-        page.text(f"{words}."),
-        page.table(table, digits=digits, first=True),
-        page.note(
-            "With all points given, half as far apart, errors between them are usually smaller. The points carry the "
-            "noise of measurement themselves. The noise above was fitted to all points, the left-out ones included."
-        ),
-    ]
+    lines = {"Left out": page.shortened(lost, MOST_LISTED), "Repaired": page.shortened(repaired, MOST_LISTED)}
+    before = [page.picture(before_and_after(track, motion), f"Track {track.key}") for track, motion in shown]
+    names: dict[str, Any] = {"r": report, "figures": figures, "before": before, "lines": lines, "digits": DIGITS}
+    names |= {"methods": methods, "points": points, "parameters": _parameters(parameters)}
+    template, title = Path(__file__).with_name("filter.html"), f"{report['source']}: {how} trajectories"
+    page.write_page(out / "report.html", title, template=template, **names)
 
 
 def points(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -141,8 +95,8 @@ def before_and_after(track: TrackPiece, motion: RegularMotion) -> Figure:
     return figure
 
 
-def _parameters(parameters: pl.DataFrame) -> list[page.Block]:
-    """Return the table of the inferred parameters; nothing where there are none."""
+def _parameters(parameters: pl.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of the inferred parameters; nothing where there are none."""
     if "max_accel" not in parameters.columns or parameters["max_accel"].drop_nulls().is_empty():
         return []
     rows = []
@@ -152,8 +106,7 @@ def _parameters(parameters: pl.DataFrame) -> list[page.Block]:
         identified = finite[f"{p.name}_identified"].drop_nulls()
         rows.append({
             "parameter": f"{p.symbol} {p.name}", "unit": p.unit, "median": float(middle),
-            "quartiles": f"{low:.2f} – {high:.2f}",
+            "quartiles": f"{low:.2f} – {high:.2f}", "tracks": finite.height,
             "identified": f"{100 * identified.to_numpy().mean():.0f} %" if len(identified) else "–",
         })  # fmt: skip
-    words = f"Of {finite.height} tracks. Identified: to within a half of the value."
-    return [page.heading("Driver parameters"), page.table(rows, digits={"median": 2}), page.note(words)]
+    return rows
