@@ -56,7 +56,7 @@ def test_filter_writes_tidy_output_and_a_report(tmp_path: Path) -> None:
     assert filtering == sorted(filtering) and len(filtering) > 4  # it moves within a chunk too
     assert [at[0] for at in seen if at not in filtering] == ["compiling", "reading", "writing"]
     page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("data:image/png") == 6 and "Savitzky–Golay" in page
+    assert page.count("data:image/png") == 5 and "Savitzky–Golay" in page
 
 
 def test_chunks_and_resume_change_nothing(tmp_path: Path) -> None:
