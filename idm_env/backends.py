@@ -1,4 +1,4 @@
-"""What may run in place of a simulator's repeated step: entered by its name, looked up when a rollout begins.
+"""Functions that run in place of a simulator's repeated step: entered by name, looked up when a rollout begins.
 
 A simulator is built below the compiled loops and does not know them. ``idm_env`` enters those that it has, as it
 registers its environments: by text, so that nothing heavy is imported before it is used.
@@ -18,7 +18,7 @@ _off: ContextVar[str | None] = ContextVar("idm_env_kernels_off", default=None)
 
 
 def enter(place: str) -> None:
-    """Enter a function by its place, ``package.module:function``; see ``rollout`` for what it is called with."""
+    """Enter a function by its place, ``package.module:function``; ``rollout`` has its arguments."""
     if place not in _entered:
         _entered.append(place)
 
@@ -39,7 +39,7 @@ def switched_off() -> str | None:
 
 
 def rollout(*call: Any) -> Any:
-    """Return what the first function that knows this call gives; None where the step itself is to be repeated.
+    """Return the result of the first function that takes this call; None where the step itself is to be repeated.
 
     The call is ``(simulator, state, inputs, params, steps, checkpoint_every, keep)``, as in ``Simulator.rollout``, and
     the result the last state with what is kept of all, or None.

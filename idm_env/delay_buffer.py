@@ -1,4 +1,4 @@
-"""What every driver saw in the last steps: the buffer that a simulator keeps where an effect looks back.
+"""Drivers' perceptions in the last steps: the buffer that a simulator keeps where an effect looks back.
 
 Shapes: a signal is ``[..., n]``, in its own SI unit; the buffer is ``(..., vehicles, slots, signals)``.
 """
@@ -18,7 +18,7 @@ PAST = "past"
 
 
 def signals(scene: Scene) -> list[Tensor]:
-    """Return what a driver perceives: own speed, then gap, speed and acceleration of each neighbour in the scene."""
+    """Return a driver's perceptions: own speed, then gap, speed and acceleration of each neighbour in the scene."""
     seen = [scene.speed]
     for neighbour in (scene.leader, scene.second_leader, scene.behind):
         if neighbour is not None:

@@ -1,4 +1,4 @@
-"""A simulator: one pure step (``step.py``), and that step repeated, or what may run instead of it (``backends.py``)."""
+"""A simulator: one pure step (``step.py``), and that step repeated, or a kernel in its place (``backends.py``)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from idm_env.types import Inputs, Params, State, mapped
 
 
 class Trajectory(NamedTuple):
-    """What a rollout keeps of every step, time first: position (m), speed (m/s), acceleration (m/s²), gap (m)."""
+    """Samples of every step of a rollout, time first: position (m), speed (m/s), acceleration (m/s²), gap (m)."""
 
     position: Tensor
     speed: Tensor
@@ -97,7 +97,7 @@ class Simulator(CarFollowingStep):
         keep: Callable[[State], tuple[Tensor, ...]] | None = _trajectory,
         seed: int | None = None,
     ) -> tuple[State, Any]:
-        """Repeat ``step``; return the last state and what ``keep`` takes of every state after a step, time first.
+        """Repeat ``step``; return the last state and the samples that ``keep`` takes of every state, time first.
 
         ``keep`` None keeps nothing, and None is returned in its place. Where a compiled kernel knows this simulator it
         runs instead of ``step`` (``kernels.dispatch`` says when). Second derivatives of a
@@ -165,7 +165,7 @@ class Simulator(CarFollowingStep):
         self.__dict__["_tried"] = True
 
     def advance(self, state: State, inputs: Inputs, params: Params) -> State:
-        """Return the state Δt later, as ``step`` does, by what may run in place of it: a rollout of one step."""
+        """Return the state Δt later, as ``step`` does, by a rollout of one step."""
         return self.rollout(state, {n: stacked([x]) for n, x in inputs.items()}, params, 1, keep=None)[0]
 
 

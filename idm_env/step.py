@@ -162,7 +162,7 @@ class CarFollowingStep:
         return torch.arange(vehicles).div(block, rounding_mode="floor") % self.decides_after
 
     def due(self, state: State) -> Tensor:
-        """Return who decides about lanes at this step (bool), to broadcast against ``(..., vehicles)``."""
+        """Return a mask of the vehicles that decide about lanes now (bool), broadcasting to ``(..., vehicles)``."""
         phase = state.clock.remainder(self.decides_after)
         return phase == (self.turns(state.speed.shape[-1]).to(phase.device) if self.decides_in_blocks else 0)
 
@@ -274,7 +274,7 @@ class CarFollowingStep:
         return {**memory, **merging.nobody(state.speed)} if self.sees_mergers else memory
 
     def scene(self, state: State, inputs: Inputs) -> Scene:
-        """Return what this step looks like to every vehicle."""
+        """Return the scene of this step, as every vehicle sees it."""
         road = self.road.view(state)
         led = road.leader_present(state.present, state.speed)
         leader = road.leader(state.gap, state.speed, state.accel, led)
@@ -307,7 +307,7 @@ class CarFollowingStep:
         return time if time.dim() == 0 else time.unsqueeze(-1)
 
     def wanted(self, scene: Scene, params: Params) -> tuple[Tensor, Scene, Driver]:
-        """Return what drivers want in a scene (m/s²), the scene as they see it, and their parameters in force."""
+        """Return the wanted accelerations (m/s²), the scene as drivers see it, and their parameters in force."""
         seen = scene
         for effect in self._hooks["perceive"]:
             seen = effect.perceive(seen, params[effect.name])  # type: ignore[arg-type]
@@ -329,7 +329,7 @@ class CarFollowingStep:
         return accel, scene, driver
 
     def answered(self, scene: Scene, params: Params) -> tuple[Tensor, Driver]:
-        """Return what vehicles do in a scene (m/s²), within limits, and the drivers' parameters in force."""
+        """Return the accelerations in a scene (m/s²), within limits, and the drivers' parameters in force."""
         accel, seen, driver = self.wanted(scene, params)
         for effect in self._hooks["limit"]:
             view = scene if effect.sees_truth else seen

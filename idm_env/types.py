@@ -45,7 +45,7 @@ Memory = Mapping[str, Tensor]
 
 
 class LaneState(NamedTuple):
-    """What a road of several lanes adds to a state: links, which are integer tensors of shape ``(..., vehicles)``.
+    """Part of a state on a road of several lanes: links, which are integer tensors of shape ``(..., vehicles)``.
 
     ``lane`` counts from the right, which is 0. ``leader`` and ``follower`` are slots in the last dimension, a vehicle's
     own slot where there is nobody (on a ring: nobody but itself), so that a leader's follower is oneself. ``changed``,
@@ -116,7 +116,7 @@ class Trips(NamedTuple):
 
 
 def _number(name: str, value: Any, row: int, least: float, most: float) -> float:
-    """Return a value of a trip as a number; ValueError, in one line, for what is none."""
+    """Return a value of a trip as a number; ValueError, in one line, for any other value."""
     kind, shown = str(getattr(value, "dtype", type(value).__name__)), " ".join(f"{value!r:.80}".split())
     try:
         number = math.nan if kind.endswith(("bool", "bytes")) else float(value)
@@ -168,7 +168,7 @@ class State(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What integration yields and replay overrides.
+    """Result of integration, which replay overrides.
 
     Displacement in this step (m), then position (m), speed (m/s), acceleration (m/s²), validity and, where records say
     it, lane at its end (−1 where they do not).
@@ -213,7 +213,7 @@ class Beside(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """What an effect of the hook ``change`` says of a change to the left and to the right.
+    """Utilities and margins of a change to the left and to the right, by an effect of the hook ``change``.
 
     Utility (m/s²): a change is wished where the sum over effects is above 0. Margin (m/s²): it is safe where the least
     of all effects is at least 0. The sum over effects also has the largest single utility of each side, for which a
@@ -235,7 +235,7 @@ class Wish(NamedTuple):
 
 
 class PastScenes(Protocol):
-    """What a simulator keeps of the steps before where an effect looks back."""
+    """Scenes of the steps before, which a simulator keeps where an effect looks back."""
 
     def at(self, scene: Scene, seconds: Tensor) -> Scene:
         """Return the scene of some seconds ago."""
@@ -245,7 +245,7 @@ class PastScenes(Protocol):
 
 
 class Scene(NamedTuple):
-    """What one step looks like to every vehicle; effects read this and know no topology.
+    """One step as every vehicle sees it; effects read this and know no topology.
 
     ``second_leader``, ``behind``, ``merger`` (who signals from a lane beside that he wants to be the leader) and
     ``lane`` (0 on the right, 0 on a road of one) are filled only where an effect of the simulator needs them, ``here``,
@@ -305,7 +305,7 @@ class Driver(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """What stands on a ``lane`` (None: on all) from ``begin`` to ``end`` (m), and whether one must stop before it."""
+    """A mark on a ``lane`` (None: on all) from ``begin`` to ``end`` (m), and whether one must stop before it."""
 
     lane: int | None
     begin: float
@@ -364,7 +364,7 @@ def mapped(function: Callable[..., Tensor], first: Tree, *rest: Any) -> Tree:
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """Have it known that what is done inside is recorded: for any values, not for these."""
+    """Mark work inside as recorded: for any values, not for these."""
     before = _RECORDED.set(True)
     try:
         yield
@@ -373,7 +373,7 @@ def recording() -> Iterator[None]:
 
 
 def worthwhile(mask: Tensor) -> bool:
-    """Return whether any is true, so that what holds only there need not be done where nobody is.
+    """Return whether any is true, so that work for those alone can be left out where there are none.
 
     True, and nothing is asked, where the answer would be waited for (a GPU) or is not one for all values (a recording).
     """

@@ -1,4 +1,4 @@
-"""Checks of what users give, numbers first: one line that names the value, the rule and the cure."""
+"""Checks of users' values, numbers first: one line that names the value, the rule and the cure."""
 
 from __future__ import annotations
 

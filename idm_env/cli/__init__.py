@@ -1,4 +1,4 @@
-"""The command line: commands, what they refuse before anything slow is imported, and what works on this machine."""
+"""The command line: commands, refusals before anything slow is imported, and a check of this machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What commands print of their results: tables and sentences, on stderr but for the tables."""
+"""Printed results of commands: tables on stdout, sentences on stderr."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def undecided(result: dict[str, Any], out: Path) -> None:
 
 
 def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
-    """Say what ``explain`` found, and what it does for the errors on the test set."""
+    """Print the findings of ``explain`` and the errors on the test set before and after."""
     if not result["models"]:
         undecided(result, out)
         return
@@ -109,6 +109,6 @@ def show_path(word: str, path: Path) -> None:
 
 
 def finished(out: Path, account: str) -> None:
-    """Say what became of the data, and where the report lies."""
+    """Print the account of the data and the path of the report."""
     console.print(account, soft_wrap=True, highlight=False)
     show_path("Report", out / "report.html")

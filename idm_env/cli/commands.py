@@ -25,7 +25,7 @@ with needed("the command line"):
 
 
 class _Refusing(typer.core.TyperCommand):
-    """A command that says what it refuses before its function imports anything slow."""
+    """A command whose refusals come before its function imports anything slow."""
 
     def invoke(self, ctx: Any) -> Any:
         refusals.refuse(ctx.params)
@@ -99,7 +99,7 @@ _stopped: list[int] = []
 
 
 def _work_begins() -> None:
-    """Make Ctrl-C an exception, so that what is done is kept; while modules are imported it could crash them."""
+    """Make Ctrl-C an exception, so that finished work is kept; while modules are imported it could crash them."""
     if signal.getsignal(signal.SIGINT) is end_at_once:
         signal.signal(signal.SIGINT, _stop)
 
@@ -645,7 +645,7 @@ def run() -> None:
 
 
 def _failed(error: Exception, code: int = 1) -> NoReturn:
-    """End with one line that says what is wrong, never longer than a terminal can take."""
+    """End with one line that names the error, never longer than a terminal can take."""
     reason = storage.full(error) or str(error) or type(error).__name__
     if storage.lacks_memory(error):
         reason = "this needs more memory than there is. Take fewer vehicles, runs or draws at a time, or free memory."

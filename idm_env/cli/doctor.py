@@ -1,4 +1,4 @@
-"""What works on this machine and what does not, each with its cure: ``idm-env doctor``."""
+"""A check of this machine, each fault with its cure: ``idm-env doctor``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Finding(NamedTuple):
 
 
 def findings(folder: Path = Path()) -> list[Finding]:
-    """Return what was found; ``folder`` is where results would be written."""
+    """Return all findings; ``folder`` is where results would be written."""
     return [
         *_versions(), *(_extra(name) for name in EXTRAS), _kernels(), _threads(), _gpu(),
         _cache("cache of printed steps", "IDM_ENV_CACHE"), _cache("compiled loops", "NUMBA_CACHE_DIR"),

@@ -136,7 +136,7 @@ class JobOptions:
 
     @contextmanager
     def running(self, report: OnProgress) -> Iterator[dict[str, Any]]:
-        """Yield the keywords that all long work takes: whether it goes on, who does its parts, and who is told."""
+        """Yield the keywords that all long work takes: ``resume``, ``executor`` and ``on_progress``."""
         with self.place.opened() as workers:
             yield {"resume": self.resume, "executor": workers, "on_progress": report}
 

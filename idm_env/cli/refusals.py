@@ -1,4 +1,4 @@
-"""What a command refuses before anything slow is imported: words of its options, and the heads of its files."""
+"""Refusals of a command before anything slow is imported: words of its options, and the heads of its files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SMALL_BYTES, LARGE_BYTES = 1 << 20, 1 << 26
 
 
 def refuse(given: Mapping[str, Any]) -> None:
-    """Raise ValueError, in one line, for what a command's parameters refuse by themselves and by their files' heads."""
+    """Raise ValueError, in one line, for impossible parameters of a command, and for the heads of its files."""
     for name, words in CHOICES.items():
         value = given.get(name)
         if value is not None and ":" not in str(value):  # my_file.py:MyLaw

@@ -93,7 +93,7 @@ def renamed(frame: pl.DataFrame, vehicles: pl.DataFrame) -> pl.DataFrame:
 
 
 def repairs(vehicles: pl.DataFrame) -> list[Repair]:
-    """Return what is to be said of mirrored vehicles."""
+    """Return the repair that counts mirrored vehicles."""
     words = (
         f"vehicles drive against the others (their position_m falls): they were mirrored, with "
         f"−position_m for position_m, and are in runs of their own, whose names end with '{SUFFIX}'."

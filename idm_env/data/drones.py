@@ -122,7 +122,7 @@ def pneuma(path: Path) -> Read:
 
 
 def _way(speed: np.ndarray, time: np.ndarray, travelled: str) -> np.ndarray:
-    """Return the way (m): speeds (m/s) integrated, and scaled to what the file says was travelled in all.
+    """Return the way (m): speeds (m/s) integrated, and scaled to the whole distance that the file gives.
 
     Distances between its points, which are of six decimals of a degree, add up to more: by 18 % at 2 m/s.
     """

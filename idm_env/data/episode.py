@@ -79,7 +79,7 @@ class Episode:
 
 @dataclass(frozen=True, eq=False)
 class Episodes(Sequence[Episode]):
-    """Episodes in the order of the table, and what was left out and why, each counted."""
+    """Episodes in the order of the table, and the rows left out, counted by reason."""
 
     items: tuple[Episode, ...]
     left_out: tuple[Repair, ...]

@@ -1,4 +1,4 @@
-"""What the data package says when it cannot go on, and what it counts when it can."""
+"""Errors of the data package, and the repairs that it counts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a model was fitted on: where every driver was at whole seconds, whatever the file is called or how it is cut."""
+"""Marks of fitted drivers: their places at whole seconds, whatever the file is called or how it is cut."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def names_by_mark(
 
 
 def fitted_on(trajectories: Trajectories, drivers: Iterable[Track]) -> dict[str, Any]:
-    """Return what ``model.yaml`` says of the data of a fit: the file's name and the marks of its drivers' tracks."""
+    """Return the entry ``fitted_on`` of ``model.yaml``: the file's name and the marks of its drivers' tracks."""
     return {"source": trajectories.source, "tracks": marks(trajectories, drivers)}
 
 

@@ -33,7 +33,7 @@ class FolderSlice:
         return f"run {first}" if first == last else f"runs {first} to {last}"
 
     def trajectories(self, *, ring_length: float | None = None, place: str | None = None) -> Trajectories:
-        """Read and check these runs. DataError for what cannot be used."""
+        """Read and check these runs. DataError for rows that cannot be used."""
         try:
             rows = _named(_scan(self.folder, list(self.files)), self.columns, self.folder.name).drop(_FILE)
             table, repairs = tidy.read((rows.filter(_run().is_in(self.runs)) if self.runs else rows).collect())
@@ -93,7 +93,7 @@ def files_of(folder: Path) -> list[str]:
 
 
 def stamp(path: Path) -> Path | list[tuple[str, int, int]]:
-    """Return what tells a file, or a folder, from another: itself, or names, sizes and times of all files in it."""
+    """Return the identity of a file (itself) or of a folder: names, sizes and times of all files in it."""
     if not path.is_dir():
         return path
     files = map(Path, files_of(path))

@@ -64,7 +64,7 @@ class Drivers:
 
 @dataclass(frozen=True)
 class View:
-    """What is around the followers at one moment, arrays [runs, followers]; NaN where there is no such vehicle."""
+    """Surroundings of the followers at one moment, arrays [runs, followers]; NaN where there is no such vehicle."""
 
     time: np.ndarray
     position: np.ndarray
@@ -100,7 +100,7 @@ def curvature(position: np.ndarray) -> np.ndarray:
 def desired_accel(
     view: View, seen: tuple[np.ndarray, np.ndarray, np.ndarray], drivers: Drivers, on: dict[str, float]
 ) -> np.ndarray:
-    """Return what the followers want (m/s²), but for the leader's acceleration and the vehicle's limits.
+    """Return the followers' wanted accelerations (m/s²), but for the leader's acceleration and the vehicle's limits.
 
     Args:
         view: The true scene.
@@ -150,7 +150,7 @@ def with_feed_forward(accel: np.ndarray, lead_accel: np.ndarray, on: dict[str, f
 
 
 def limited(accel: np.ndarray, speed: np.ndarray, held: np.ndarray, on: dict[str, float]) -> np.ndarray:
-    """Return what the vehicles do of what is wanted: asymmetry, action points, power, brakes."""
+    """Return the accelerations within the vehicles' limits (m/s²): asymmetry, action points, power, brakes."""
     if "asymmetry" in on:
         accel = accel - on["asymmetry"] * np.abs(accel)
     if "action_point" in on:

@@ -1,4 +1,4 @@
-"""Who follows whom, and at what gap: leaders derived or checked, gaps measured or taken from positions."""
+"""Leaders and gaps: leaders derived or checked, gaps measured or taken from positions."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def derive(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def derived(followers: int, lanes: bool) -> Repair:
-    """Return what is to be said of so many vehicles whose leaders were derived."""
+    """Return the repair that counts vehicles whose leaders were derived."""
     source = "lane and position" if lanes else "position, all vehicles being in one lane"
     text = f"leader_id is absent: the leaders of {followers} vehicles were derived from {source}."
     return Repair("leaders derived", followers, text)
@@ -64,7 +64,7 @@ def named_leaders(frame: pl.DataFrame, vehicles: pl.DataFrame) -> tuple[pl.DataF
 
 
 def named(counts: pl.DataFrame, source: str) -> list[Repair]:
-    """Return what is to be said of the leaders that a file names.
+    """Return the repairs of the leaders that a file names.
 
     Raises:
         DataError: If leaders are named, and none is another vehicle of its run.
@@ -127,7 +127,7 @@ def gaps(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
 
 
 def gap_of(joined: pl.DataFrame) -> pl.DataFrame:
-    """Return what ``headways`` gives with the gap in force in gap_m, and without what it was taken from."""
+    """Return the rows of ``headways`` with the gap in force in gap_m, without the columns that it was taken from."""
     gap = pl.when(pl.col("gap_measured")).then(pl.col("gap_m")).otherwise(pl.col("headway") - pl.col("lead_length"))
     gap = pl.when(pl.col("leader_id").is_not_null()).then(gap)
     return joined.with_columns(gap.alias("gap_m")).drop("lead_position", "lead_length", "headway")

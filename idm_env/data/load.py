@@ -105,7 +105,7 @@ def files_of(paths: Sequence[Path]) -> list[Path]:
 def refuse_head(
     path: Path, layout: str, conditions: Iterable[str], place: str | None, by: str | None, columns: Columns = None
 ) -> None:
-    """Raise DataError for what ``load`` refuses in the first rows of a file, and for columns that it has not.
+    """Raise DataError for refusals of ``load`` in the first rows of a file, and for columns that it has not.
 
     ``conditions`` are of the form ``column=value``; ``by`` is a column that tells groups apart. Of layouts that are no
     table only the path is looked at.
@@ -349,7 +349,7 @@ def _odd_line(path: Path) -> str:
 
 
 def _unreadable(path: Path, error: BaseException) -> DataError:
-    """Return the error in one line; of what is packed, two libraries would say the same fault in two ways."""
+    """Return the error in one line; of packed files, two libraries would say the same fault in two ways."""
     if isinstance(error, DataError):
         return error
     packed = next((kind for kind in ("parquet", "gz") if path.name.lower().endswith(f".{kind}")), None)

@@ -54,7 +54,7 @@ Columns = Mapping[str, str] | str | None
 
 
 def entries(columns: Columns) -> list[tuple[str, str]]:
-    """Return what is asked for as names and the texts behind them. DataError for what names no column."""
+    """Return the names of columns and the texts behind them. DataError for a text that names no column."""
     items: list[tuple[Any, ...]]
     if isinstance(columns, str):
         items = [tuple(part.strip() for part in text.split("=", 1)) for text in columns.split(",")]
@@ -67,7 +67,7 @@ def entries(columns: Columns) -> list[tuple[str, str]]:
 
 
 def pairs(columns: Columns) -> tuple[tuple[str, str], ...]:
-    """Return what is asked for as pairs of a tidy name and the text behind it. DataError for what names no column."""
+    """Return pairs of a tidy name and the text behind it. DataError for a name of no column."""
     columns_by_name: dict[str, str] = {}
     for pair in entries(columns):
         name = SHORT.get(pair[0], pair[0])
@@ -154,7 +154,7 @@ def check_columns(columns: list[str], source: str) -> None:
 
 
 def guessed(columns: list[str]) -> str:
-    """Return the option ``--columns`` that a header may need, and what to know of it; ``?`` where nothing fits.
+    """Return the option ``--columns`` that a header may need, with remarks; ``?`` where nothing fits.
 
     One of two coordinates is never proposed as a position along the road, nor a frame as a time without its rate.
     """
@@ -231,7 +231,7 @@ def _check_plane(frame: pl.DataFrame, taken: Mapping[str, str], source: str) -> 
 
 
 def unread(columns: list[str]) -> list[Repair]:
-    """Return what is to be said of columns under other names that look like tidy ones which are not there."""
+    """Return the repair that names unread columns which look like tidy ones that are missing."""
     looks: dict[str, str] = {}
     for name, pattern in GUESSES.items():
         others = [c for c in columns if name not in columns and c not in (*TIDY, *looks) and _like(name, pattern, c)]

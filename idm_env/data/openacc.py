@@ -32,7 +32,7 @@ def header_line(lines: list[str]) -> int | None:
 
 
 def about(lines: list[str]) -> dict[str, str | list[str]]:
-    """Return what the lines above the table say: names, setting and mode, under the names of the tidy table."""
+    """Return the facts in the lines above the table: names, setting and mode, under the names of the tidy table."""
     cells = {}
     for line in lines:
         key, *values = [cell.strip().strip('"') for cell in line.strip().split(",")]

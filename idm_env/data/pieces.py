@@ -23,14 +23,14 @@ def recordings(
     path: Path, *, ring_length: float | None = None, place: str | None = None, layout: str = "auto",
     columns: Columns = None, where: Sequence[str] | None = None, seconds: float | None = None,
 ) -> Trajectories:  # fmt: skip
-    """Return what ``load`` reads of a file, of it what ``where`` names, cut into runs of so many ``seconds``."""
+    """Return the trajectories of a file, those that ``where`` selects, cut into runs of so many ``seconds``."""
     trajectories = load(path, ring_length=ring_length, place=place, layout=layout, columns=columns)
     trajectories = trajectories if where is None else trajectories.where(where)
     return trajectories if seconds is None else split_runs(trajectories, seconds)
 
 
 def seconds_of(text: str | None) -> float | None:
-    """Return the seconds of ``60s`` or ``60``. ValueError for what is no duration of 20 s to a day."""
+    """Return the seconds of ``60s`` or ``60``. ValueError for any text but a duration of 20 s to a day."""
     if text is None:
         return None
     try:
@@ -83,7 +83,7 @@ def split_runs(trajectories: Trajectories, seconds: float) -> Trajectories:
 
 
 def cure(trajectories: Trajectories) -> str | None:
-    """Return what makes one recording several runs, the longest that serve, or says that nothing does; None of several.
+    """Return advice on cutting one recording into runs, the longest that serve; None of several recordings.
 
     A vehicle that follows nobody makes no run.
     """

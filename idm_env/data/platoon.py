@@ -103,7 +103,7 @@ class Platoon:
         return rates
 
     def _chained(self, k: int, accel: np.ndarray, speed: np.ndarray, lagged: np.ndarray) -> np.ndarray:
-        """Return the limited accelerations; each follower may react to what the one ahead does at this moment."""
+        """Return the limited accelerations; each follower may react to that of the one ahead at this moment."""
         if not {"leader_acceleration", "brake_light"} & set(self.on):
             return hidden.limited(accel, speed, self._held, self.on)
         result = np.empty_like(accel)

@@ -146,7 +146,7 @@ class Jumps:
 
 @dataclass
 class Overlaps:
-    """In how many rows with a leader the gap is not positive, over all pieces of a file, and who is in them."""
+    """Rows with a leader and no positive gap, over all pieces of a file, counted by vehicle."""
 
     rows: int = 0
     overlaps: int = 0
@@ -166,7 +166,7 @@ class Overlaps:
                 self.among[run, vehicle] += some
 
     def check(self, source: str, vehicles: int) -> list[Repair]:
-        """Return what is to be said of one of so many vehicles, without which the others hardly overlap.
+        """Return the repair for one of so many vehicles, without which the others hardly overlap.
 
         DataError where so many bodies are in one place that they cannot be on one lane.
         """

@@ -25,7 +25,7 @@ def rows(
 
 
 def measured(frame: pl.DataFrame, jumps: plausible.Jumps) -> tuple[pl.DataFrame, list[Repair]]:
-    """Return whole vehicles, sorted, by the rules for what was measured of each: lengths, laps, jumps, single speeds.
+    """Return whole vehicles, sorted, with the rules for lengths, laps, jumps and single speeds applied.
 
     ``jumps`` counts those of the file.
     """

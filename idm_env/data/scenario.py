@@ -1,4 +1,4 @@
-"""What a scenario is, whatever file it comes from: agents over time, lanes, stop signs and signals."""
+"""Scenarios, whatever file they come from: agents over time, lanes, stop signs and signals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What synthetic platoons are given: leaders that stop, go and run away, a queue beside them, and drivers' noise."""
+"""Inputs of synthetic platoons: leaders that stop, go and run away, a queue beside them, and drivers' noise."""
 
 from __future__ import annotations
 

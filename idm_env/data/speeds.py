@@ -43,7 +43,7 @@ def lengths(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
 
 
 def length_assumed(without: int) -> list[Repair]:
-    """Return what is to be said of so many vehicles without a length."""
+    """Return the repair that counts vehicles without a length."""
     return repaired("length assumed", without, f"vehicles have no length_m; {schema.DEFAULT_LENGTH_M} m is assumed.")
 
 

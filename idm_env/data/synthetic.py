@@ -24,7 +24,7 @@ _MEDIANS = {"time_gap": 1.3, "min_gap": 2.2, "max_accel": 1.4, "comfort_decel": 
 
 @dataclass(frozen=True)
 class Truth:
-    """What the generator knows and a fitted model is to find.
+    """The truth behind generated data, which a fitted model is to find.
 
     Attributes:
         effects: Strength by name of the effects at work; empty if none.

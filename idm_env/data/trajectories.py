@@ -179,7 +179,7 @@ class Trajectories:
 
 
 def parted(condition: str) -> tuple[str, str]:
-    """Return column and value of ``column=value``. DataError for what has another form."""
+    """Return column and value of ``column=value``. DataError for any other form."""
     column, equals, value = (part.strip() for part in condition.partition("="))
     if not equals or not column:
         raise DataError(f"{condition!r} is no condition; write it as column=value, such as split=test.")

@@ -251,7 +251,7 @@ class Evaluation:
 
 
 def judgement_of(evaluation: Evaluation, decided: Decided) -> tuple[Judgement, Solution]:
-    """Return what the test set says of what was decided, and the drivers' parameters beside what is compared."""
+    """Evaluate the selected model on the test set; return the judgement and the drivers' parameters fitted with it."""
     null, rounds, last = decided.null, decided.rounds, evaluation.of_null[0]
     confirmed, refusal = _confirmed(evaluation, decided)
     # Where nothing was added, what came nearest is compared with the null and says what it would have done.

@@ -103,7 +103,7 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class Decided:
-    """The null, models after every addition (the last without what is not needed), what was seen, and what joins.
+    """Result of the search: null model, models after each accepted term, all candidates by round, joined terms.
 
     ``null_in_closed_loop`` is IDM in free simulation, before anything was added.
 
@@ -139,7 +139,7 @@ def decide(searching: Search, null: Solution, seed: int) -> Decided:
 def _joined(
     searching: Search, null: Solution, steps: list[Solution], rounds: list[Round], seed: int
 ) -> together.Joined | None:
-    """Return what holds in free simulation beside what windows told, and add to ``rounds`` what was seen."""
+    """Search terms by closed-loop score on top of the last model; append tested candidates to ``rounds``."""
     now, last = steps[-1] if steps else null, rounds[-1]
     few = last.refusal is not None and last.refusal.reason is Reason.FEW_RUNS
     if few or (steps and (_is_shape(now) or _at_floor(searching, now))):

@@ -1,4 +1,4 @@
-"""What an effect is: one hook of six, parameters of its own, and static choices that are never tensors.
+"""Effects: one hook of six, parameters of their own, and static choices that are never tensors.
 
 Shapes: what belongs to vehicles is ``[..., n]``, in SI units; parameters are scalars or ``[..., n]``.
 """
@@ -204,7 +204,7 @@ class Effect:
         return scene.accel
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return what remains of the summed acceleration (m/s²)."""
+        """Return the summed acceleration within a limit (m/s²)."""
         return accel
 
     def place(self, motion: Motion, scene: Scene, p: P) -> Motion:
@@ -212,7 +212,7 @@ class Effect:
         return motion
 
     def change(self, scene: Scene, driver: Driver, p: P) -> Wish:
-        """Return what speaks for a change to either side; ``scene.here``, ``left`` and ``right`` are there."""
+        """Return utilities and margins of a change to either side; ``scene.here``, ``left`` and ``right`` are there."""
         none = torch.zeros_like(scene.speed)
         return Wish(none, none, none, none)
 
@@ -225,7 +225,7 @@ class Effect:
         return None
 
     def marks(self, time: float, p: P) -> tuple[Mark, ...]:
-        """Return what stands on the road at a time (s) and is drawn, for scalar parameters; usually nothing."""
+        """Return the marks to draw on the road at a time (s), for scalar parameters; usually none."""
         return ()
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor | None:

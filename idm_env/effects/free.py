@@ -102,7 +102,7 @@ class OverFeature:
 
     @property
     def wind_up_s(self) -> float:
-        """The whole record, for what remembers."""
+        """The whole record, for a feature of the past."""
         return math.inf if self.remembers else Effect.wind_up_s
 
     def x_of(self, scene: Scene, driver: Driver, period: float | None = None) -> Tensor:

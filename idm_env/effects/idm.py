@@ -46,7 +46,7 @@ def soft_floor(x: Tensor, floor: Tensor | float, sharpness: float) -> Tensor:
 
 
 def free_accel(driver: Driver, speed: Tensor) -> Tensor:
-    """Return what IDM drivers want without a leader: ``a [1 − (v/v0)⁴]`` (m/s²)."""
+    """Return the acceleration of IDM drivers without a leader: ``a [1 − (v/v0)⁴]`` (m/s²)."""
     square = (speed / driver.desired_speed).square()
     return driver.max_accel * (1.0 - square * square)
 

@@ -1,4 +1,4 @@
-"""What the vehicle can: asymmetry, action points, power, lag, brakes and tyres (hook ``limit``, chained by rank)."""
+"""Limits of the vehicle: asymmetry, action points, power, lag, brakes and tyres (hook ``limit``, chained by rank)."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class PowerLimit(Effect):
     )
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return the smaller of the wanted acceleration and what the engine gives."""
+        """Return the smaller of the wanted acceleration and the engine's (m/s²)."""
         return torch.minimum(accel, p["power"] / scene.speed.clamp_min(0.1))
 
 

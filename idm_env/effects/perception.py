@@ -1,4 +1,4 @@
-"""What the driver sees: delayed, blurred, biased or imagined scenes (hook ``perceive``)."""
+"""Perceptions of the driver: delayed, blurred, biased or imagined scenes (hook ``perceive``)."""
 
 from __future__ import annotations
 

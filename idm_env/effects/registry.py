@@ -64,7 +64,7 @@ def read(where: str) -> type[Effect]:
 
 
 def member(where: str, kind: str) -> tuple[ModuleType, object]:
-    """Return the module at ``my_file.py:name`` and what has that name there, None for nothing.
+    """Return the module at ``my_file.py:name`` and its member of that name, None for none.
 
     The file is run for that, unless this process has imported it. ValueError, in one line, for whatever it raises.
     """

@@ -1,4 +1,4 @@
-"""What the road tells its drivers: speed limits, lanes that are closed, signals, and where they must be to leave it."""
+"""Rules of the road: speed limits, closed lanes, signals, and the lanes on which drivers leave."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def _rows(kind: str, rows: Sequence[Sequence[float]], names: Sequence[str]) -> N
 
 
 def _is_on(scene: Scene, lane: float) -> Tensor:
-    """Return who is on a lane (bool)."""
+    """Return a mask of the vehicles on a lane (bool, ``[..., n]``)."""
     assert scene.lane is not None
     return (scene.lane - lane).abs() < (0.5 if lane != EVERY_LANE else math.inf)
 
 
 def _before(room: Tensor, scene: Scene, driver: Driver) -> Tensor:
-    """Return what IDM brakes more for somebody who stands ``room`` metres ahead than for the leader (m/s², ≤ 0)."""
+    """Return the additional IDM deceleration for a standing obstacle ``room`` metres ahead of a driver (m/s², ≤ 0)."""
     leader = interaction(driver, scene.speed, scene.leader.gap, scene.leader.speed) * scene.leader.present
     more = torch.relu(interaction(driver, scene.speed, room, torch.zeros_like(room)) - leader)
     return torch.where(room < FAR, -driver.max_accel * more, 0.0)
@@ -121,7 +121,7 @@ class LaneClosure(Effect):
         return room
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return what drivers brake for somebody who stands where the lane is closed (m/s²)."""
+        """Return the deceleration for a standing obstacle where the lane is closed (m/s²)."""
         return _before(self._room(scene, FAR), scene, driver)
 
 
@@ -163,7 +163,7 @@ class Signal(Effect):
         return (Mark(None, place, place, red),) if p["red"] > 0 else ()
 
     def _stops(self, scene: Scene, p: P) -> Tensor:
-        """Return who stops at the line (bool, ``[..., n]``)."""
+        """Return a mask of the vehicles that stop at the line (bool, ``[..., n]``)."""
         since, red = self.phase(scene.time, p)
         way = p["place"] - scene.position
         can = scene.speed * scene.speed <= 2.0 * p["most_decel"] * way
@@ -171,7 +171,7 @@ class Signal(Effect):
         return (way >= 0) & (goes_on | (red & can))
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return what drivers brake for somebody who stands at the line while it is red (m/s²)."""
+        """Return the deceleration for a standing obstacle at the line while it is red (m/s²)."""
         return _before(torch.where(self._stops(scene, p), p["place"] - scene.position, FAR), scene, driver)
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
@@ -179,7 +179,7 @@ class Signal(Effect):
         return torch.zeros_like(scene.speed)
 
     def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return 1 for who stops, otherwise 0."""
+        """Return 1 for drivers that stop, otherwise 0."""
         return torch.where(self._stops(scene, p), 1.0, 0.0).to(scene.speed.dtype)
 
 

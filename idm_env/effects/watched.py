@@ -1,4 +1,4 @@
-"""Hooks of effects of one's own, watched: what they return, and that what they are given stays as it is.
+"""Hooks of effects of one's own, watched: the results' kinds and shapes, and that inputs stay unchanged.
 
 The package's effects are not watched: the laws of ``tests/laws`` hold them to the same.
 """
@@ -65,7 +65,7 @@ def watched(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Give every tensor, or what stands in for one, with its name: ``leader.gap`` of a scene, a parameter's name."""
+    """Yield every tensor, or its stand-in, with its name: ``leader.gap`` of a scene, a parameter's name."""
     if isinstance(tree, Tensor) or hasattr(tree, "suspected"):
         yield path or type(tree).__name__, tree
     elif isinstance(tree, Mapping):
@@ -106,7 +106,7 @@ def _check(who: str, kind: type, result: Any, results: Mapping[str, Any], leaves
 
 
 def _judged(side: str, leaves: Mapping[str, Tensor]) -> Tensor:
-    """Return whose results must be numbers: many an equation has a root or a logarithm of a gap, so not where it is 0.
+    """Return a mask of results that must be numbers: not where a gap is 0, of which many an equation has a root.
 
     Overlaps are told as crashes. Of a lane beside (``side``) only what exists counts.
     """

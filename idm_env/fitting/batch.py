@@ -143,7 +143,7 @@ class Batch:
         )
 
     def inputs(self, simulator: Simulator, seed: int = 0) -> Inputs:
-        """Return the record of everybody but the driver, and what other effects take from the measurement.
+        """Return the record of everybody but the driver, and the measured inputs of other effects.
 
         Normals are drawn with ``seed``. DataError for an effect whose input no measurement has.
         """

@@ -1,4 +1,4 @@
-"""Likelihood of recorded lane changes: a logit of what effects wish for, and two models that know no effects.
+"""Likelihood of recorded lane changes: a logit of the effects' wishes, and two models that know no effects.
 
 A driver stays (0), or changes to the left or right where there is a lane and room, with probability::
 
@@ -81,7 +81,7 @@ class Choice(abc.ABC):
 
 @dataclass(frozen=True)
 class UtilityLogit(Choice):
-    """The logit of what a simulator's effects wish for; ``free`` are full names of parameters of these effects."""
+    """The logit of the wishes of a simulator's effects; ``free`` are full names of parameters of these effects."""
 
     simulator: Simulator
     free: tuple[str, ...]
@@ -120,7 +120,7 @@ class UtilityLogit(Choice):
         return utility / theta[-3] + torch.nn.functional.logsigmoid(margin / theta[-3])
 
     def log_probabilities(self, theta: Tensor, decisions: Decisions) -> Tensor:
-        """Return ``ln (λ/2 + (1 − λ) r Q)`` of both sides, and what is left for staying."""
+        """Return ``ln (λ/2 + (1 − λ) r Q)`` of both sides, and the remainder for staying."""
         wished_for = super().log_probabilities(theta, decisions)
         attention, lapse = theta[-2], theta[-1]
         sides = decisions.possible.to(theta.dtype)
@@ -187,7 +187,7 @@ class GapLogit(Choice):
 
 
 class Chosen(NamedTuple):
-    """A fitted model of decisions: values, standard errors, log-likelihood, and what is doubtful (bool)."""
+    """A fitted model of decisions: values, standard errors, log-likelihood, and flags of doubt (bool)."""
 
     model: Choice
     theta: Tensor
@@ -197,7 +197,7 @@ class Chosen(NamedTuple):
     identified: Tensor
 
     def table(self) -> list[dict[str, Any]]:
-        """Return one row per parameter: estimate, standard error, 95 % interval, and what is doubtful."""
+        """Return one row per parameter: estimate, standard error, 95 % interval, and flags of doubt."""
         columns = zip(self.theta, self.standard_error, self.at_bound, self.identified, strict=True)
         return [estimate_row(p.name, p, *column) for p, column in zip(self.model.parameters, columns, strict=True)]
 

@@ -1,4 +1,4 @@
-"""What a fit says of its drivers: one row each, and how many of them have a parameter on its bound."""
+"""Fitted drivers: one row each, and how many of them have a parameter on its bound."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST_ROWS = 1000
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """What was fitted, [groups, parameters] each, whether by one fit or by several that know nothing of each other.
+    """Estimates, [groups, parameters] each, whether of one fit or of several that know nothing of each other.
 
     ``dt`` is the data's time step (s), ``fixed`` what was not fitted and has not its default.
     """
@@ -56,7 +56,7 @@ class Estimates:
 
     @classmethod
     def joined(cls, table: pl.DataFrame, simulator: Simulator, dt: float, fixed: Mapping[str, float]) -> Estimates:
-        """Return what several fits found, from the rows of their ``Fit.table()``."""
+        """Return the estimates of several fits, from the rows of their ``Fit.table()``."""
         names = tuple(table["parameter"].unique(maintain_order=True))
         count = len(names)
 
@@ -70,7 +70,7 @@ class Estimates:
 
 
 def table(result: Fit, error: Errors, by: str) -> list[dict[str, Any]]:
-    """Return one row per group: episodes, gap RMSE (m), each parameter with its standard error, and what is doubtful.
+    """Return one row per group: episodes, gap RMSE (m), each parameter with its standard error, and flags of doubt.
 
     A driver is told by ``run_id`` and ``vehicle_id``, another ``group`` by its name. What is not identified is NaN.
     ``bounds`` and ``not_identified`` list parameters by name, separated by blanks.
@@ -126,7 +126,7 @@ def _on_bounds(rows: list[dict[str, Any]]) -> list[tuple[str, int]]:
 def over_fitting(
     rows: list[dict[str, Any]], fitted: float, held_out: float | None, by: str, parts: str = "runs"
 ) -> str:
-    """Return what over-fitting shows, and what to do; nothing where it does not show.
+    """Return the signs of over-fitting and the cure; nothing where there are none.
 
     It shows in a gap RMSE (m) on held-out ``parts`` (runs or drivers) above 1.5 times that on the fitted ones, and in a
     parameter that is on its bound for more than a third of several groups.
@@ -145,7 +145,7 @@ def over_fitting(
 
 
 def failure(rows: list[dict[str, Any]], error: Errors) -> str:
-    """Return in what a fit failed, and what to look at; nothing where it did not.
+    """Return the signs of a failed fit and the cure; nothing where there are none.
 
     It failed where most stretches collide, or the median gap RMSE is above the median gap; above half of it with most
     estimates on bounds, or a tenth with four of five. Bounds alone are no failure: seconds of an even drive have them.

@@ -51,7 +51,7 @@ class Fit:
         return torch.cat((self.own, self.shared.expand(len(self.own), -1)), dim=-1)
 
     def table(self) -> list[dict[str, Any]]:
-        """Return one row per group and parameter: estimate, standard error, 95 % interval, and what is doubtful."""
+        """Return one row per group and parameter: estimate, standard error, 95 % interval, and flags of doubt."""
         values, columns, rows = self.values(), self.uncertainty, []
         for g, group in enumerate(self.problem.groups):
             for i, (name, p) in enumerate(zip(self.names, self.problem.parameters, strict=True)):

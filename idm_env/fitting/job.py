@@ -138,7 +138,7 @@ def _data(trajectories: Trajectories, items: Episodes) -> dict[str, Any]:
 
 
 def _noise(trajectories: Trajectories, path: Path) -> str:
-    """Return that positions are raw and what to do first; nothing where their noise is below ``NOISY_M``."""
+    """Return the warning that positions are raw, with its cure; nothing where their noise is below ``NOISY_M``."""
     tracks = [p["position_m"].to_numpy() for _, p in trajectories.table.head(MOST_ROWS).group_by(TRACK) if len(p) > 20]
     sigma = float(np.median([noise_sigma(track) for track in tracks])) if tracks else 0.0
     if sigma <= NOISY_M:
@@ -217,7 +217,7 @@ def _drivers(items: Episodes) -> list[tuple[str, str]]:
 def _held_out(
     source: Source, options: Options, held: Trajectories, estimates: Estimates, pooled: Estimates
 ) -> tuple[dict[str, Any], tuple[Repair, ...]]:
-    """Return the errors on runs that the fit has not seen, and what of them was left out."""
+    """Return the errors on runs that the fit has not seen, and the rows of them left out."""
     items = source.episodes(held)
     batch = Batch.stack(items, substeps=options.substeps)
     group, names = group_of(batch.episodes, options.by)

@@ -1,4 +1,4 @@
-"""The command ``fit --lane-changes``: a file with lanes in, MOBIL's parameters and what they are worth out."""
+"""The command ``fit --lane-changes``: a file with lanes in, MOBIL's parameters and held-out likelihoods out."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ChangeOptions:
 
 
 class LaneChanges(NamedTuple):
-    """Decisions, the models fitted to them (MOBIL first), and what each of them says of drivers it has not seen."""
+    """Decisions, the models fitted to them (MOBIL first), and their likelihoods of held-out drivers."""
 
     decisions: Decisions
     fitted: tuple[discrete_choice.Chosen, ...]

@@ -1,4 +1,4 @@
-"""What ``fit`` and ``simulate`` are asked for: how a file is read, and how a model is fitted."""
+"""Options of ``fit`` and ``simulate``: how a file is read, and how a model is fitted."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Options:
     base: str | None = None
 
     def simulator(self) -> tuple[Simulator, dict[str, float]]:
-        """Return what is calibrated and the parameters that stay.
+        """Return the simulator to calibrate and the parameters that stay.
 
         That is the car-following law ``base`` (None: IDM), or a saved model, whose effects are kept.
         ValueError for a law beside a model that has one.

@@ -1,4 +1,4 @@
-"""A fit in parts: some drivers each, fitted by whoever the executor gives them to, joined afterwards.
+"""A fit in parts: some drivers each, fitted by the executor's workers, joined afterwards.
 
 Parts know nothing of each other: a part's drivers start from the pooled optimum of that part. So a part is the same
 bytes wherever and how often it is done.
@@ -35,7 +35,7 @@ PARAMETERS, DRIVERS, ERRORS = "parameters", "drivers", "errors"
 
 @dataclass(frozen=True)
 class Piece:
-    """A part of a fit: the episodes in hand, or runs of a folder that are read by whoever fits them."""
+    """A part of a fit: the episodes in hand, or runs of a folder that are read where they are fitted."""
 
     number: int
     of: int
@@ -111,7 +111,7 @@ def _fit_piece(piece: Piece, on_progress: OnProgress) -> None:
 
 
 def _summary(trajectories: Trajectories, left_out: Sequence[Repair]) -> dict[str, Any]:
-    """Return what a part of a folder is, so that all of them can be added up."""
+    """Return the counts of a part of a folder, so that all of them can be added up."""
 
     def plain(repairs: Sequence[Repair]) -> list[list[Any]]:
         return [[r.kind, r.count, r.text] for r in repairs]
@@ -122,7 +122,7 @@ def _summary(trajectories: Trajectories, left_out: Sequence[Repair]) -> dict[str
 
 @dataclass(frozen=True, eq=False)
 class JoinedFit:
-    """What all pieces of a fit found: estimates, errors of every episode, and what each piece told."""
+    """Results of all pieces of a fit: estimates, errors of every episode, and the summary of each piece."""
 
     parts: Parts
     estimates: drivers.Estimates
@@ -164,7 +164,7 @@ def join(parts: Parts, options: Options) -> JoinedFit:
 
 
 def account_of(joined: JoinedFit, source: str) -> dict[str, Any]:
-    """Return what the parts of a folder are together, as ``Trajectories.summary`` says it of a file."""
+    """Return the counts of all parts of a folder, as ``Trajectories.summary`` has them of a file."""
     data = [summary["data"] for summary in joined.summaries]
     repairs, left_out = Counted(), Counted()
     for summary in joined.summaries:

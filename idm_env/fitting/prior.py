@@ -1,4 +1,4 @@
-"""What is known of parameters before the data: log-normal priors, by which little data give a maximum a posteriori."""
+"""Log-normal priors of parameters, by which little data give a maximum a posteriori."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Prior:
             raise ValueError(f"prior noise = {self.noise:g} must be positive, in the unit of the residual.")
 
     def equations(self, own: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what the prior adds to cost [..., G], gradient Jᵀr [..., G, P] and Gauss–Newton matrix."""
+        """Return the prior's parts of cost [..., G], gradient Jᵀr [..., G, P] and Gauss–Newton matrix."""
         residual = self.noise * torch.log(own / self.centre) / self.deviation
         slope = self.noise / (self.deviation * own)
         return residual.square().sum(-1), slope * residual, torch.diag_embed(slope.square())

@@ -1,4 +1,4 @@
-"""A fitting problem: which parameters are free, who shares them, and what the residual is.
+"""A fitting problem: its free parameters, own and shared, and its residual.
 
 Free parameters are *own* (one value per group of drivers) or *shared* (one value for all). Values travel as two
 tensors: ``own`` [..., groups, P] and ``shared`` [..., Q], in the order of the names.

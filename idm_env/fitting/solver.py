@@ -52,7 +52,7 @@ class Known(Protocol):
     """Prior of the own parameters."""
 
     def equations(self, own: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what it adds to cost [..., G], gradient [..., G, P] and Gauss–Newton matrix; own [..., G, P]."""
+        """Return its parts of cost [..., G], gradient [..., G, P] and Gauss–Newton matrix; own [..., G, P]."""
 
     def following(self, own: Tensor) -> Known:
         """Return the same at other values, for a population whose centre is that of its drivers."""
@@ -75,7 +75,7 @@ class LeastSquares(Protocol):
 
     @property
     def costs(self) -> Callable[[Tensor, Tensor], Tensor] | None:
-        """What ``normal`` has as cost, where that is had for much less; trials of shared parameters are judged by it.
+        """The cost of ``normal``, where that is had for much less; trials of shared parameters are judged by it.
 
         Without it they are judged after the own ones have followed for ``FOLLOWING`` steps.
         """
@@ -162,7 +162,7 @@ def minimise(
     tolerance: float = 1e-6,
     on_step: Callable[[Progress, Normal], None] | None = None,
 ) -> tuple[Progress, Normal]:
-    """Find own and shared parameters; return them and the normal equations there, with what is known beforehand.
+    """Find own and shared parameters; return them and the normal equations there, with the prior.
 
     Without shared parameters a group has converged when an accepted step lowers its cost by less than ``tolerance`` of
     it, when a refused step promised no more than that, or when no damping up to 1e8 finds a lower one; the search ends

@@ -30,7 +30,7 @@ class Uncertainty(NamedTuple):
 def estimate_row(
     name: str, p: Parameter, estimate: Tensor, error: Tensor, at_bound: Tensor, identified: Tensor
 ) -> dict[str, Any]:
-    """Return one parameter's row of a table: estimate [], standard error [], 95 % interval, and what is doubtful."""
+    """Return one parameter's row of a table: estimate [], standard error [], 95 % interval, and flags of doubt."""
     middle, half = float(estimate), 1.96 * float(error)
     return {
         "parameter": name, "symbol": p.symbol, "unit": p.unit, "estimate": middle, "standard_error": float(error),

@@ -149,7 +149,7 @@ class _LostError(Exception):
 
 
 class _Workers(Protocol):
-    """Whoever takes parts: ``submit`` gives a handle, ``wait`` one that is done, ``result`` what came of it."""
+    """Workers that take parts: ``submit`` gives a handle, ``wait`` one that is done, ``result`` its result."""
 
     def room(self) -> int: ...
     def submit(self, payload: bytes) -> Any: ...
@@ -300,7 +300,7 @@ class _Team:
             raise _LostError(f"the process that worked on it died {ATTEMPTS} times", False) from None
 
     def close(self, handles: Sequence[Any] = ()) -> None:
-        """End all processes at once: what they have not finished is done again by whoever goes on."""
+        """End all processes at once: unfinished parts are done again by a later run."""
         if self._pool is None:
             return
         processes = compat.processes_of(self._pool)

@@ -66,7 +66,7 @@ class _Bars:
         self._bars.start_task(task)
 
     def end(self) -> None:
-        """End the running phase: it stays with what it did, or goes where its length was not known."""
+        """End the running phase: its line stays with the count, or goes where its length was not known."""
         if self._running:
             task = self._tasks[self._running]
             done = self._bars.tasks[self._bars.task_ids.index(task)]

@@ -47,7 +47,7 @@ class Parts:
         return True
 
     def finish(self, number: int, summary: dict[str, Any]) -> None:
-        """Mark a part as done, with what is to be remembered of it; its tables must have been written before."""
+        """Mark a part as done, with its summary; its tables must have been written before."""
         tables = {p.name: storage.fingerprint(p) for p in self.folder.glob(f"{number:06d}.*.parquet")}
         self.store.put_json(f"{number:06d}", {"summary": storage.plain(summary), "tables": tables})
 

@@ -1,4 +1,4 @@
-"""What is kept on disk: files in one piece, results that overwrite nothing of a user's, and work that can go on.
+"""Files in one piece, results that overwrite nothing of a user's, and work that can go on.
 
 One mechanism for every command. ``write`` replaces a file only by a whole one. ``results`` guards a folder of results:
 no output is an input, and nothing is overwritten that ``run.json`` there does not name as ours. ``Store`` holds what an
@@ -131,7 +131,7 @@ def write_csv(path: Path, table: pl.DataFrame | pl.LazyFrame) -> None:
 
 
 def read(path: Path, reader: Callable[[Path], R], cure: str) -> R:
-    """Return what ``reader`` makes of a file of ours; ValueError with the cure, in one line, for a broken file."""
+    """Return the ``reader``'s result for a file of ours; ValueError with the cure, in one line, for a broken file."""
     try:
         return reader(path)
     except Exception as error:
@@ -304,7 +304,7 @@ def _real(path: Path | str) -> Path:
 
 
 def _mark(folder: Path) -> dict[str, Any] | None:
-    """Return what the ``run.json`` of a folder says, or None where it is none of ours."""
+    """Return the content of a folder's ``run.json``, or None where it is none of ours."""
     try:
         mark = json.loads((folder / MARK).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -321,7 +321,7 @@ def _sign(folder: Path, **content: Any) -> None:
 
 
 class Store:
-    """What an interrupted run goes on with: contents by key, and files of the run's own under ``folder``.
+    """Saved state of an interrupted run: contents by key, and files of the run's own under ``folder``.
 
     The folder belongs to one run, told by the fingerprint of its data and options in its ``run.json``. Without
     ``resume`` it is emptied, but only if that ``run.json`` is a store's, and nothing on the way there is a link.
@@ -366,7 +366,7 @@ class Store:
         self._put(key, buffer.getvalue())
 
     def get(self, key: str) -> Any:
-        """Return what was kept by ``put``, or None."""
+        """Return the content that ``put`` saved, or None."""
         import torch
 
         return self._get(key, lambda content: torch.load(io.BytesIO(content), weights_only=True))
@@ -376,7 +376,7 @@ class Store:
         self._put(key, json.dumps(content).encode())
 
     def get_json(self, key: str) -> Any:
-        """Return what was kept by ``put_json``, or None."""
+        """Return the content that ``put_json`` saved, or None."""
         return self._get(key, json.loads)
 
     def saved_names(self) -> list[str]:
@@ -419,7 +419,7 @@ def _refuse_links(folder: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder of ours, what says so last: whoever is killed on the way leaves one that is still ours."""
+    """Delete a folder of ours; its ownership marker goes last, so an interrupted deletion can be resumed."""
     for path in folder.iterdir():
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)

@@ -1,4 +1,4 @@
-"""Whose code runs here: a file that names the place of a class names code of whoever wrote it, run only if trusted."""
+"""Trust in code that files name: a file with the place of a class names its author's code, run only if trusted."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def always() -> None:
 
 @contextmanager
 def trusting(trusted: bool = True) -> Iterator[None]:
-    """Trust the files that are read inside; ``False`` leaves it as it is. ValueError for what is neither."""
+    """Trust the files that are read inside; ``False`` leaves it as it is. ValueError for any other value."""
     if not isinstance(trusted, bool):
         raise ValueError(f"trusted is of type {type(trusted).__name__}, and must be True or False.")
     token = _given.set(trusted or _given.get())

@@ -1,4 +1,4 @@
-"""What several lanes need of a step, as functions of a state that run before it: trips, incentives, lane changes."""
+"""Several lanes: trips, incentives and lane changes, as functions of a state that run before a step."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def due(schedule: Trips, time: Tensor) -> Tensor:
 
 
 def counts(stepping: CarFollowingStep, state: State) -> Counts:
-    """Return what became of all trips; ValueError for a state without any."""
+    """Return the counts of all trips, by their state; ValueError for a state without any."""
     if state.lanes is None or state.lanes.trips is None or state.present is None:
         raise ValueError("this state has no trips. Make it with multilane.demand.waiting(…).")
     trips = state.lanes.trips
@@ -153,7 +153,7 @@ def _departed(stepping: CarFollowingStep, state: State, now: Tensor) -> State:
 
 
 def _enter(stepping: CarFollowingStep, state: State, params: Params, now: Tensor) -> State:
-    """Return the state after those have entered for whom it is time and who have room, one on each lane.
+    """Return the state after due trips with room have entered, one on each lane.
 
     Of a lane's queue the first enters at the beginning of the lane, where the gap s to the last vehicle there allows::
 
@@ -202,7 +202,7 @@ def _rear_of_leaving(state: State, lanes: Tensor) -> Tensor:
 
 
 class _Entry(NamedTuple):
-    """Who enters each lane, ``(…, lanes)``: whether anybody, who behind whom (slots), where, at what gap and speed."""
+    """Candidate entry of each lane, ``(…, lanes)``: whether there is one, slots, position (m), gap (m), speed (m/s)."""
 
     goes: Tensor
     first: Tensor

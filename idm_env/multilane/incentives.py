@@ -1,4 +1,4 @@
-"""Lane changes: what drivers would want beside, and what they wish.
+"""Lane changes: drivers' accelerations on the lanes beside, and their wishes.
 
 Effects see a scene with ``here``, ``left`` and ``right`` and know no topology; the road chooses, resolves conflicts and
 executes. Hypothetical pairs are answered by the simulator's own effects, perception and adaptation included, up to what

@@ -1,4 +1,4 @@
-"""Who drives on a route: hypotheses of what a driver is up to, each fitted to the last second by the project's ``fit``.
+"""Drivers on a route: hypotheses of their intentions, each fitted to the last second by the project's ``fit``.
 
 One second barely identifies five parameters. So each hypothesis (goes for the limit, keeps the speed, stops somewhere,
 stays) brings a log-normal prior of urban driving; ``fit`` behind the real leader finds the posterior's mode and
@@ -56,7 +56,7 @@ NAMES = (*CENTRE, "desired_speed")
 
 @dataclass(frozen=True)
 class DriverHypothesis:
-    """What a driver may be up to: its share of drivers beforehand, the speed wanted, and where it stops.
+    """A hypothesis of a driver's intention: its prior share, the speed wanted, and where it stops.
 
     ``speed`` and ``deviation`` are median (m/s) and log-deviation of the speed wanted here and now; ``bend`` tells that
     it is a bend's and says nothing of the speed wanted behind it. ``stop`` is a distance from the front bumper (m).

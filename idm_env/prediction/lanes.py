@@ -82,7 +82,7 @@ def arc_length(line: np.ndarray) -> np.ndarray:
 
 
 class LaneGraph:
-    """The lanes of a scene and what follows each: by the file, or by ends that meet in one direction."""
+    """The lanes of a scene and their successors: by the file, or by ends that meet in one direction."""
 
     def __init__(self, lanes: Sequence[MapLane]) -> None:
         self.lanes = {lane.id: lane for lane in lanes if arc_length(lane.line)[-1] > 0.1}

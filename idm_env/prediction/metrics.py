@@ -104,7 +104,7 @@ def shape_of(position: np.ndarray, heading: np.ndarray, speed: np.ndarray, valid
 
 @dataclass(frozen=True)
 class Score:
-    """What is kept of a case: per horizon minADE and minFDE (m, None without truth) and which futures hit (or None)."""
+    """Score of a case: per horizon minADE and minFDE (m, None without truth) and which futures hit (or None)."""
 
     kind: str
     shape: str
@@ -133,7 +133,7 @@ def summary(scores: Sequence[Score]) -> dict[str, float | int]:
 
 
 def intervals(scores: Sequence[Score], scenes: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Return 95 % bootstrap intervals of what ``summary`` returns at each horizon, by name such as ``minADE_8s``.
+    """Return 95 % bootstrap intervals of the measures of ``summary`` at each horizon, by name such as ``minADE_8s``.
 
     Whole scenes are drawn where there are at least ``ENOUGH_SCENES``, since agents of a scene are alike, else agents.
     NaN where there is no truth, or a single agent.
@@ -191,7 +191,7 @@ def average_precision(scores: Sequence[Score], seconds: int, weights: np.ndarray
 
 
 def _means(values: Sequence[float | None], weights: np.ndarray) -> np.ndarray:
-    """Return the mean of what is known under every row of weights [draws, agents]."""
+    """Return the mean of known values under every row of weights [draws, agents]."""
     numbers = np.array([np.nan if v is None else v for v in values], float)
     finite = np.isfinite(numbers)
     total = weights[:, finite].sum(1)

@@ -1,4 +1,4 @@
-"""The scene from above: lanes, everybody, and of one agent its history, futures and what it did."""
+"""The scene from above: lanes, everybody, and of one agent its history, futures and true path."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ LATERAL_S = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Futures [F, S, 2] at 10 Hz with confidences [F] of one agent, and by what: ``lane``, ``free`` or a baseline.
+    """Futures [F, S, 2] at 10 Hz with confidences [F] of one agent, and their source: ``lane``, ``free`` or a baseline.
 
     ``parameters`` holds mean and deviation of each of IDM's five after the last second, where a lane tells them.
     """
@@ -36,7 +36,7 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """What an agent may do, in the order of ``shares.WAYS``: futures [N, S, 2] and weights [N] of every way.
+    """An agent's futures [N, S, 2] and weights [N] of every way, in the order of ``mixture.WAYS``.
 
     Without lanes the last way is empty. ``parameters`` as in ``Prediction``.
     """

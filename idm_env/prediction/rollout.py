@@ -65,7 +65,7 @@ class RouteLeader:
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Drivers on a route behind what is ahead, from arc length ``begin`` (m, centre) on."""
+    """Drivers on a route behind a leader, from arc length ``begin`` (m, centre) on."""
 
     route: Route
     drivers: RouteDrivers
@@ -74,7 +74,7 @@ class Course:
 
 
 def nobody(steps: int) -> RouteLeader:
-    """Return what stands for an empty road ahead: something that is far away and keeps away."""
+    """Return a leader that stands for an empty road: far away, and keeping away."""
     return RouteLeader(np.full(steps + 1, AWAY_M), np.full(steps + 1, 30.0))
 
 

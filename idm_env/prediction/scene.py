@@ -1,4 +1,4 @@
-"""A scenario as drivers see it: their routes, who is ahead on them, where they must stop, and what leaders will do."""
+"""A scenario as drivers see it: their routes, the leaders on them, stop lines, and the leaders' futures."""
 
 from __future__ import annotations
 

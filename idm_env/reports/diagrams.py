@@ -97,7 +97,7 @@ def panels(data: Any, *, ring_length: float | None = None) -> list[Panel]:
 def rollout_panel(
     data: Any, *, dt: float = 0.1, row: int = 0, ring_length: float | None = None, marked: Sequence[int] = ()
 ) -> Panel:
-    """Return the panel of what a rollout keeps (position and speed, time first, vehicles last)."""
+    """Return the panel of a rollout's trajectory (position and speed, time first, vehicles last)."""
     position, speed = (np.asarray(x.detach().cpu(), float) for x in (data.position, data.speed))
     while position.ndim > 2:
         index = row if position.ndim == 3 else 0
@@ -250,7 +250,7 @@ def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
 
 
 def axes_of(panel: Panel, drawn: Sequence[Panel]) -> tuple[tuple[float, float], tuple[str, str]]:
-    """Return what is subtracted of times (s) and positions (m), so that axes begin near 0, and the axes' names.
+    """Return offsets of times (s) and positions (m), so that axes begin near 0, and the axes' names.
 
     Times of all that are ``drawn`` have one origin.
     """
@@ -261,7 +261,7 @@ def axes_of(panel: Panel, drawn: Sequence[Panel]) -> tuple[tuple[float, float], 
 
 
 def far_from_0(values: tuple[float, float]) -> float:
-    """Return what is subtracted of values between two: nothing, unless they lie far from 0 for the width they have."""
+    """Return the offset of values between two: 0, unless they lie far from 0 for the width they have."""
     low, high = values
     if not low > 2.0 * (high - low) and not high < -2.0 * (high - low):
         return 0.0

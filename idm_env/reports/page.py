@@ -1,4 +1,4 @@
-"""What every report shares: one self-contained HTML page, pictures inside it, and files that are never half written."""
+"""Reports' pages: one self-contained HTML page, pictures inside it, and files that are never half written."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ EXPLAINED = ("report.json", "report.html", *_MODELS, *GROUPS, FOUND, *SEARCH)
 
 
 def write(trajectories: Trajectories, cure: str, out: Path, inputs: Iterable[Path] = ()) -> dict[str, Any]:
-    """Write and return what can be said of one recording, of which nothing can be held out, and the ``cure``.
+    """Write and return the report on one recording, of which nothing can be held out, with the ``cure``.
 
     The report has the keys of every report of ``explain``; there is no model.
     """

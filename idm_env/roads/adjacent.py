@@ -20,7 +20,7 @@ from idm_env.types import FAR, Neighbour, State, Wish
 
 
 class Side(NamedTuple):
-    """The lane on one side of every vehicle: whether it may be entered, and who is there.
+    """The lane on one side of every vehicle: whether it may be entered, and the neighbours there.
 
     ``gap`` (m) would be the vehicle's own, ``back_gap`` the follower's; both are ``FAR`` where nobody is. ``ends`` is
     how far the vehicle could go on there (m); ``leader`` and ``follower`` are slots.
@@ -103,7 +103,7 @@ class Sideways(Ending):
         self, state: State, exists: Tensor, leader: Any, follower: Any, led: Tensor, followed: Tensor,
         to_leader: Tensor, to_follower: Tensor, ends: Tensor,
     ) -> Side:  # fmt: skip
-        """Return a lane beside, from who is there; ``to_leader`` and ``to_follower`` are laps to add on a ring (m)."""
+        """Return a lane beside, from its neighbours; ``to_leader`` and ``to_follower`` are laps on a ring (m)."""
         position, length = state.position, state.length
         ahead = self.at(position, leader) - self.at(length, leader) - position + to_leader
         back = position - length - self.at(position, follower) + to_follower

@@ -1,4 +1,4 @@
-"""What a road is: who leads whom, and how gaps follow from displacements. Roads know no drivers.
+"""Roads: leaders by topology, and gaps from displacements. Roads know no drivers.
 
 Shapes: what belongs to vehicles is ``[..., n]``, in SI units.
 """
@@ -16,7 +16,7 @@ from idm_env.types import FAR, LaneState, Neighbour, State
 
 
 class Outline(NamedTuple):
-    """What there is to draw of a road of several lanes: its ``length`` or ``ring`` (m), else neither.
+    """Outline to draw of a road of several lanes: its ``length`` or ``ring`` (m), else neither.
 
     ``lanes``: of each, right lane first, where it begins, where one must stop, and where one leaves it (m).
     """
@@ -58,7 +58,7 @@ class Road(abc.ABC):
     def lane_state(
         self, position: Tensor, length: Tensor, lane: Tensor | int | None, present: Tensor | None
     ) -> LaneState | None:
-        """Return who leads whom at these positions, lengths (m) and lanes: None where the order never changes.
+        """Return the links at these positions, lengths (m) and lanes: None where the order never changes.
 
         ValueError for lanes on a road that has one only.
         """
@@ -67,7 +67,7 @@ class Road(abc.ABC):
         return None
 
     def placed(self, state: State, lane: Tensor, after: State) -> State:
-        """Return the state ``after`` a step in which records say who is on which lane, −1 where they do not.
+        """Return the state ``after`` a step in which records give vehicles' lanes, −1 where they do not.
 
         ValueError on a road that has one lane only.
         """
@@ -79,7 +79,7 @@ class Road(abc.ABC):
 
     @property
     def outline(self) -> Outline | None:
-        """What there is to draw of several lanes, None on a road of one."""
+        """The outline of several lanes to draw, None on a road of one."""
         return None
 
     @property
@@ -88,7 +88,7 @@ class Road(abc.ABC):
         return False
 
     def remaining(self, present: Tensor | None, position: Tensor) -> Tensor | None:
-        """Return who is still on the road at these positions (m)."""
+        """Return presence (1 or 0) of the vehicles still on the road at these positions (m)."""
         return present
 
     @abc.abstractmethod

@@ -16,7 +16,7 @@ from idm_env.types import FAR, Neighbour
 
 
 def nearer(leader: Neighbour, room: Tensor | None) -> Neighbour:
-    """Return the leader, or whoever stands where the lane ends (``room`` metres ahead) if that is nearer."""
+    """Return the leader, or a standing obstacle where the lane ends (``room`` metres ahead) if that is nearer."""
     if room is None:
         return leader
     return either(room < leader.gap, (room, 0.0, 0.0, 1.0), leader)

@@ -1,4 +1,4 @@
-"""Several lanes side by side: vehicles keep their slot for life, and links say who leads whom.
+"""Several lanes side by side: vehicles keep their slot for life, and links give their leaders.
 
 Between two lane changes the order within a lane does not change, so gaps stay state; ``Lanes.lane_state`` sorts anew
 only where somebody changes, comes or goes.
@@ -50,7 +50,7 @@ class Lanes(LaneLayout, Road):
     def lane_state(
         self, position: Tensor, length: Tensor, lane: Tensor | int | None, present: Tensor | None
     ) -> LaneState:
-        """Return who leads whom at these positions, lengths (m) and lanes.
+        """Return the links at these positions, lengths (m) and lanes.
 
         ValueError for a lane that does not exist, or vehicles that do not fit theirs on a ring.
         """

@@ -20,7 +20,7 @@ from idm_env.types import FAR, LaneState, Moving, Neighbour, State, worthwhile
 
 
 class Claim(NamedTuple):
-    """What becomes of every vehicle's wish: the lane it is granted (or its own), and bool tensors of why not.
+    """Outcome of every vehicle's wish: the lane it is granted (or its own), and bool tensors of why not.
 
     ``follower`` is the slot of whom the change was judged by, ``judged`` whether there is one. ``signals`` is where
     those look who were not granted it (1 left, −1 right, 0 nowhere).
@@ -36,7 +36,7 @@ class Claim(NamedTuple):
 
 
 def still_changing(state: State) -> Tensor:
-    """Return who is still leaving a lane (bool)."""
+    """Return a mask of the vehicles still leaving a lane (bool)."""
     assert state.lanes is not None and state.lanes.moving is not None
     return state.lanes.moving.until > state.clock
 
@@ -91,7 +91,7 @@ class _Look(torch.autograd.Function):
 
 @dataclass(frozen=True, eq=False)
 class Linked(Sideways):
-    """Lanes as they are in one state: neighbours by its links; ends of lanes and who is leaving merged into leaders."""
+    """Lanes in one state: neighbours by its links; ends of lanes and leaving vehicles merged into leaders."""
 
     road: LaneLayout
     links_now: LaneState
@@ -155,13 +155,13 @@ class Linked(Sideways):
         return self.goes_on() if self.road.closed else None
 
     def remaining(self, present: Tensor | None, position: Tensor) -> Tensor | None:
-        """Return who is still on the road at these positions (m)."""
+        """Return presence (1 or 0) of the vehicles still on the road at these positions (m)."""
         if present is None or not self.road.leaving:
             return present
         return present * (position < self.road.left_at(self.links_now.lane, position)).to(present.dtype)
 
     def placed(self, state: State, lane: Tensor, after: State) -> State:
-        """Return the state ``after`` a step in which records say who is on which lane, with gaps to new leaders.
+        """Return the state ``after`` a step in which records give vehicles' lanes, with gaps to new leaders.
 
         Whoever is placed may be anywhere, so all are laid out anew.
         """
@@ -178,7 +178,7 @@ class Linked(Sideways):
     # -- who is still leaving a lane ------------------------------------------------------------------------------
 
     def leader(self, gap: Tensor, speed: Tensor, accel: Tensor, present: Tensor) -> Neighbour:
-        """Return the leader, the end of the lane or whoever is still leaving it: which is nearest."""
+        """Return the nearest of the leader, the end of the lane and a vehicle still leaving it."""
         nearest = super().leader(gap, speed, accel, present)
         if self.shadow is None:
             return nearest
@@ -281,7 +281,7 @@ class Linked(Sideways):
         )  # fmt: skip
 
     def chosen(self, sides: tuple[Side, Side], prefers: Preference, due: Tensor) -> Claim:
-        """Return what becomes of every wish: per gap the best claim is granted.
+        """Return the outcome of every wish: per gap the best claim is granted.
 
         A gap of a lane is known by the vehicle at its front. Of claims of equal utility the one towards the road's
         hand is granted, then the one of the first slot.
@@ -309,7 +309,7 @@ class Linked(Sideways):
         )  # fmt: skip
 
     def mergers(self, state: State, sides: tuple[Side, Side], claim: Claim) -> Tensor:
-        """Return, for everybody who stays, the slot of whoever signals that he wants to be his leader: own for nobody.
+        """Return for each vehicle the slot of the vehicle signalling to merge ahead of it; its own slot if none.
 
         Of two the one whose front is nearer, then the first slot.
         """

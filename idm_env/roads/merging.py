@@ -1,4 +1,4 @@
-"""What drivers remember from one decision about lanes to the next: their lane, and who signals from one beside.
+"""Drivers' memory from one decision about lanes to the next: their lane, and the vehicle that signals beside.
 
 Shapes: what belongs to drivers is ``[..., n]``; slots are indices into the last dimension.
 """
@@ -26,7 +26,7 @@ def nobody(like: Tensor) -> dict[str, Tensor]:
 
 
 def merger(memory: Memory, speed: Tensor) -> Neighbour:
-    """Return whoever is remembered to signal, as a leader would be seen."""
+    """Return the vehicle that is remembered to signal, as a leader would be seen."""
     if MERGER_GAP not in memory:
         none = torch.zeros_like(speed)
         return Neighbour(none + FAR, speed, none, none)

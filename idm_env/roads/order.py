@@ -77,7 +77,7 @@ class Order(NamedTuple):
         return self.slots.gather(-1, index.clamp(0, self.slots.shape[-1] - 1))
 
     def around(self, lane: Tensor, position: Tensor) -> Around:
-        """Return who would be ahead of and behind every vehicle on these lanes, which are not its own.
+        """Return the neighbours ahead of and behind every vehicle on these lanes, which are not its own.
 
         Who is exactly beside counts as behind: with a gap of minus one's own length.
         """
@@ -101,7 +101,7 @@ class Order(NamedTuple):
 
 
 def laps(position: Tensor, leader: Tensor, ring: float) -> Tensor:
-    """Return what has to be added to ``position[leader] − position`` on a ring, in whole laps (m), elementwise.
+    """Return the whole laps (m) to add to ``position[leader] − position`` on a ring, elementwise.
 
     The leader is less than a lap ahead; who follows himself is a lap behind himself.
     """

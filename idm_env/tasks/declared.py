@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 def one_declared(entry: object, kind: type[T], known: Mapping[str, T], where: str) -> T:
-    """Return what an entry means: itself if it is of the ``kind``, else what has that name or lies at that place.
+    """Resolve an entry: an instance of ``kind``, a name of the catalogue, or ``file.py:name``.
 
     ValueError, in one line, for an unknown name, and for the place of code that is not trusted or has no such thing.
     """

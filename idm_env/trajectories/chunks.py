@@ -38,7 +38,7 @@ PARAMETER_SCHEMA: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """What determines a run: task, step (s; None takes the file's), recipe, ablation, baselines, vehicles per chunk.
+    """Settings of a run: task, step (s; None takes the file's), recipe, ablation, baselines, vehicles per chunk.
 
     ``model`` is a model.yaml whose effects are behind the drivers' own parameters; None is IDM.
     """
@@ -54,7 +54,7 @@ class FilterSettings:
 
 @dataclass(frozen=True)
 class FilePlan:
-    """What is decided for the whole file: step (s), noise, and whether samples are dense; ``seconds`` it took."""
+    """Decisions for the whole file: step (s), noise, and whether samples are dense; ``seconds`` it took."""
 
     dt: float
     noise: PositionNoise | None

@@ -37,7 +37,7 @@ def simulator(dt: float) -> Simulator:
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """What the simulator did, per track: position (m), speed (m/s), acceleration (m/s²), imagined gap (m), each [K].
+    """The simulator's motion, per track: position (m), speed (m/s), acceleration (m/s²), imagined gap (m), each [K].
 
     The acceleration of the last step is that which would follow.
     """

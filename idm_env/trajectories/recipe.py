@@ -67,7 +67,7 @@ def nearest(track: TrackPiece, clock: np.ndarray) -> np.ndarray:
 
 
 class Neighbourhood:
-    """Who follows whom among tracks, old ones (already written) included; all by index."""
+    """Followers and leaders among tracks, old ones (already written) included; all by index."""
 
     def __init__(self, tracks: Sequence[TrackPiece], clocks: Sequence[np.ndarray]) -> None:
         self.clocks = clocks
@@ -164,7 +164,7 @@ def _measured_gap(m: Meeting, around: Neighbourhood) -> np.ndarray:
 def _ties(
     meetings: Sequence[Meeting], around: Neighbourhood, positions: Sequence[np.ndarray], count: int
 ) -> dict[int, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return, per track to change, steps and positions that keep it clear of what it overlaps with."""
+    """Return, per track to change, steps and positions that keep it clear of others."""
     ties: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     for m in meetings:
         gap = _gap(m, around, positions)

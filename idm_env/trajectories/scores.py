@@ -1,4 +1,4 @@
-"""What is reported of trajectories: the paper's three metrics, and errors against a truth where there is one.
+"""Metrics of trajectories: the paper's three, and errors against a truth where there is one.
 
 Shapes: everything of a trajectory is ``[samples]``, in SI units.
 """

@@ -42,7 +42,7 @@ class PositionNoise:
     accel_time: float = math.inf
 
     def step(self, dt: float) -> tuple[float, float, float, float]:
-        """Return what remains of acceleration and noise after a step, and the variances that each gains."""
+        """Return the decay of acceleration and noise over a step, and the variances that each gains."""
         keep = math.exp(-dt / self.accel_time)
         fade = math.exp(-dt / self.time)
         return keep, fade, self.jerk * dt, self.sigma**2 * (1 - fade * fade) + 1e-12

@@ -270,7 +270,7 @@ def _borders(runs: Sequence[str], chunk: int) -> tuple[int, ...]:
 
 
 def _indexed(piece: pl.DataFrame) -> pl.DataFrame:
-    """Return what is known per vehicle of a piece.
+    """Return the facts of each vehicle of a piece.
 
     Its first and last time with the positions there, lane, rows, whether it is on a ring, and how often its time runs
     backward.
@@ -284,7 +284,7 @@ def _indexed(piece: pl.DataFrame) -> pl.DataFrame:
 
 
 def _merged(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
-    """Return what is known per vehicle of the file."""
+    """Return the facts of each vehicle of the file."""
     return pl.concat(parts).group_by(TRACK, maintain_order=True).agg(
         pl.col("begin").min(), pl.col("end").max(), pl.col("from").sort_by("begin").first(),
         pl.col("to").sort_by("end").last(), pl.col("rises").sum(), pl.col("lane").drop_nulls().first(),
