@@ -262,9 +262,7 @@ def ceiling(responses: places.Responses, prior_spread: float = 0.15) -> np.ndarr
     """
     rows = responses.rows
     records, dt = rows.records, rows.records.dt
-    pieces = responses.change.shape[1]
-    second = max(1, round(1.0 / dt))
-    middle = rows.start[:, None] + second * np.arange(pieces) + second // 2
+    middle = rows.middle
     v, gap, lead_speed = records.speed[middle], records.gap[middle], records.column("lead_speed")
     closing, lead_accel = v - lead_speed[middle], records.column("lead_accel")[middle]
     now = [v / 10.0, 2.0 * np.log(np.maximum(gap, 0.5) / 15.0), closing / 2.0, lead_accel]

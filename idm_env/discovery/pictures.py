@@ -121,7 +121,7 @@ def dependences(ladder: Ladder | None) -> Figure | None:
 def _residual(d: Discovery) -> list[np.ndarray]:
     """Return the residual acceleration before and after [R, J]: how much more the driver gains in speed each second."""
     problem, rows, dt = d.problem, d.problem.rows, d.problem.rows.records.dt
-    ends = dt * np.arange(d.responses.change.shape[1] + 1) * max(1, round(1.0 / dt))
+    ends = dt * rows.seconds
     shown = []
     for s in (d.null, d.final)[: len(d.judgement.titles)]:
         speed = np.pad(problem.errors(s.theta[None], s.model, s.values[None])[0, :, :-2], ((0, 0), (1, 0)))

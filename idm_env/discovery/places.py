@@ -8,6 +8,7 @@ so that thousands of places cost one rollout of 21 copies.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -66,19 +67,14 @@ class Responses:
 def respond(problem: Problem, solution: Solution) -> Responses:
     """Return the responses at a solution."""
     rows, records = problem.rows, problem.rows.records
-    seconds = max(1, round(1.0 / records.dt))
-    pieces = max(rows.steps // seconds, 1)
-    pulses = np.zeros((1 + len(WHATS) * pieces, 4))
-    for w in range(len(WHATS)):
-        for j in range(pieces):
-            pulses[1 + w * pieces + j] = (w + 1, j * seconds, (j + 1) * seconds, PULSE)
+    every = [(w + 1, *part, PULSE) for w in range(len(WHATS)) for part in pairwise(rows.seconds)]
+    pulses = np.array([(0, 0, 0, 0), *every], dtype=float)
     copies = len(pulses)
     theta = np.repeat(solution.theta[None], copies, axis=0)
     values = np.repeat(solution.values[None], copies, axis=0)
     residual = problem.residual(problem.errors(theta, solution.model, values, pulses))
-    change = (residual[1:] - residual[0]).reshape(len(WHATS), pieces, len(rows), -1) / PULSE
-    middle = rows.start[:, None] + seconds * np.arange(pieces) + seconds // 2
-    place, speed = records.column("place")[middle], records.speed[middle]
+    change = (residual[1:] - residual[0]).reshape(len(WHATS), -1, *residual.shape[1:]) / PULSE
+    middle, speed, place = rows.middle, records.speed[rows.middle], records.column("place")[rows.middle]
     coordinates = {
         "position": np.mod(place, records.period) if records.period else place,
         "time": records.column("time")[middle],

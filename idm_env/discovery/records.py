@@ -237,6 +237,16 @@ class Rows:
         return replace(self, valid=self.valid & (since >= begin[:, None]))
 
     @cached_property
+    def seconds(self) -> np.ndarray:
+        """Steps from the start at which the parts of about a second begin and end that a row is cut into [J + 1]."""
+        return np.linspace(0, self.steps, max(1, round(self.steps * self.records.dt)) + 1).round().astype(int)
+
+    @cached_property
+    def middle(self) -> np.ndarray:
+        """Index of the sample in the middle of every such part, [rows, J]."""
+        return self.start[:, None] + self.seconds[:-1] + np.diff(self.seconds) // 2
+
+    @cached_property
     def samples(self) -> np.ndarray:
         """Index of every kept sample, [rows, samples], inside the record."""
         ahead = self.start[:, None] + self.every * (1 + np.arange(self.steps // self.every))

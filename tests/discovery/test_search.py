@@ -183,6 +183,21 @@ def test_a_model_has_one_curve_over_the_past(platoon: Records) -> None:
         Hypothesis((since, mean))
 
 
+@pytest.mark.parametrize("dt", [0.04, 0.1, 0.2, 0.3])
+def test_responses_of_all_seconds_are_that_of_the_whole_window(dt: float) -> None:
+    """At every time step: a change that lasts is what its parts of a second add up to."""
+    searching, null = begun(made(3, runs=2, followers=1, seconds=30.0, dt=dt), "drag")
+    problem, always = searching.problem, terms.curve("time_gap", "time", 0.0, 200.0, 2)
+    rows, change = problem.rows, places.respond(problem, null).change[places.WHATS.index("time_gap")]
+    assert rows.seconds[0] == 0 and rows.seconds[-1] == rows.steps and change.shape[0] == rows.middle.shape[1]
+
+    def left(model: Hypothesis, values: np.ndarray) -> np.ndarray:
+        return problem.residual(problem.errors(null.theta[None], model, values[None]))[0]
+
+    together = left(Hypothesis((always,)), np.full(2, 0.01)) - left(Hypothesis(), np.zeros(0))
+    np.testing.assert_allclose(0.01 * change.sum(0), together, rtol=0.0, atol=0.05 * abs(together).max())
+
+
 CURVES = (
     terms.interval("time_gap", "position", 100.0, 200.0, 0.3),
     terms.interval("time_gap", "time", 20.0, 50.0, 0.3),
