@@ -102,6 +102,12 @@ def _held(before: Outcome, after: Outcome, over: Any) -> Outcome:
     return Outcome(seen, reward, ended, cut, Whole(*map(kept, before.whole, total.whole)), details)
 
 
+def _summed(rows: Mapping[str, np.ndarray], steps: int) -> dict[str, np.ndarray]:
+    """Return outputs of steps under one action, from those of each of them ``[steps, rows, …]``, as ``_held``."""
+    paid = {n: rows[n][:steps] for n in ("reward", "whole_reward", "info_rewards") if n in rows}
+    return {n: x[steps - 1].copy() for n, x in rows.items()} | {n: sum(x[1:], x[0].copy()) for n, x in paid.items()}
+
+
 _DETAILS = tuple((name, f"info_{name}") for name in INFO)
 
 
@@ -135,8 +141,10 @@ class Batch:
         self.episodes = np.full(count, -1, dtype=np.int64)
         self._world: EnvState | None = None
         self._moves = Moves(settings)
-        self._values = self._compiled()
+        self.values: Values | None = self._compiled()
+        """The worlds as compiled loops step them, None where torch does."""
         self._several = self.task.road.outline is not None
+        self._entered = self.task.journeys > 0
         self._loaded = False
         self._seen: Any = None
         self._reasons: dict[int, str] = {}
@@ -171,8 +179,8 @@ class Batch:
     @property
     def world(self) -> EnvState | None:
         """The worlds as they are now, or None before the first reset."""
-        if self._world is None and self._loaded and self._values is not None:
-            self._world = self._values.current()
+        if self._world is None and self._loaded and self.values is not None:
+            self._world = self.values.current()
         return self._world
 
     @world.setter
@@ -181,8 +189,8 @@ class Batch:
 
     def glance(self) -> EnvState:
         """Return the worlds as they are now, for reading only and until the next step."""
-        if self._world is None and self._loaded and self._values is not None:
-            return self._values.glance()
+        if self._world is None and self._loaded and self.values is not None:
+            return self.values.glance()
         assert self._world is not None
         return self._world
 
@@ -222,8 +230,8 @@ class Batch:
         """Put new worlds into some rows, or all; return the observations of all of them."""
         if every or not self.begun or self._draw is None:
             self.world, self._draw = fresh, draw
-        elif self._values is not None and self._loaded and self._seen is not None:
-            self._values.replace(index, fresh)
+        elif self.values is not None and self._loaded and self._seen is not None:
+            self.values.replace(index, fresh)
             self._draw = Draw(self._draw.key.index_put((torch.as_tensor(index),), draw.key))
             self._world = self._block = None
             # Only these rows look anew.
@@ -297,12 +305,12 @@ class Batch:
             assert self._draw is not None
             self._block = self.task.normals(self._draw, clock(), steps, self.settings.dtype)
             self.used, self._drawn_steps = 0, steps
-            if self._values is not None:
+            if self.values is not None:
                 self._drawn = {name: x.numpy().reshape(-1) for name, x in self._block.items()}
 
     def ahead(self) -> tuple[int, dict[str, np.ndarray] | None]:
         """Return for how many steps normals are there, and these; ``used`` counts those that are gone."""
-        values = self._values
+        values = self.values
         assert values is not None
         if not self.task.simulator.draws:
             return 64, None
@@ -333,26 +341,21 @@ class Batch:
 
     def settle(self) -> None:
         """See that the present worlds lie where compiled loops step them."""
-        if self._world is not None and not self._loaded and self._values is not None:
-            self._values.load(self._world)
+        if self._world is not None and not self._loaded and self.values is not None:
+            self.values.load(self._world)
             self.saw(self.task.observe(self._world))
 
     def mark(self) -> tuple[Any, ...]:
         """Return what ``back_to`` goes back to."""
-        assert self._values is not None
+        assert self.values is not None
         own = {n: self.__dict__[n] for n in _MARKED}
-        return {**own, "episodes": self.episodes.copy()}, self._values.mark()
-
-    @property
-    def values(self) -> Values | None:
-        """The worlds as compiled loops step them, None where torch does."""
-        return self._values
+        return {**own, "episodes": self.episodes.copy()}, self.values.mark()
 
     def back_to(self, mark: tuple[Any, ...]) -> None:
         """Undo steps, and resets within them."""
-        assert self._values is not None
+        assert self.values is not None
         self.__dict__.update(mark[0])
-        self._values.back_to(mark[1])
+        self.values.back_to(mark[1])
         self._beginnings.forget()
 
     @in_memory
@@ -367,16 +370,16 @@ class Batch:
         end; until it is reset it drives on unseen. Whoever enters meanwhile is commanded from the next action on.
         """
         self._reasons = {}
-        if self.task.journeys and action is not None:
+        if self._entered and action is not None:
             on_road = self.on_road()
             live = on_road if live is None else live & on_road
         held = self.task.held
-        outcome = self._once(action, live, held == 1)
-        for left in reversed(range(held - 1)):
+        outcome, done = self._once(action, live, held == 1, held)
+        for left in reversed(range(held - done)):
             over = outcome.whole.terminated | outcome.whole.truncated
             if not _some(~over):
                 break
-            outcome = _held(outcome, self._once(action, live, not left or _some(over)), over)
+            outcome = _held(outcome, self._once(action, live, not left or _some(over))[0], over)
         if self.counters is None or "stops" not in self.settings.info:
             return outcome
         self.counters.decided(self.glance().state)
@@ -388,9 +391,19 @@ class Batch:
         """Return how a row has crashed in this step, or one of its agents."""
         return self._reasons.get(row) or self.task.crash_reason(self.glance(), row, agent)
 
-    def _once(self, action: Tensor | np.ndarray | None, live: Tensor | None, observed: bool) -> Outcome:
-        """Advance every row by Δt; observations need not be read where nobody decides next."""
-        outcome = self._stepped(action, live, observed)
+    def _once(self, action: Any, live: Tensor | None, observed: bool, steps: int = 1) -> tuple[Outcome, int]:
+        """Advance every row by Δt, or by some of ``steps`` at once, and say how many.
+
+        Observations need not be read where nobody decides next. Several are done at most until somebody has ended.
+        """
+        watched = self.recording is not None or (self.counters is not None and bool(self.counters.loops))
+        stepped = None
+        if self.values is not None and not self.task.simulator.untried:
+            stepped = self._step_values(action, live, 1 if watched or self.settings.output == "torch" else steps)
+        if stepped is None:
+            with torch.no_grad() if self.settings.output == "numpy" else contextlib.nullcontext():
+                stepped = self._step_torch(action, live, observed), 1
+        outcome, done = Outcome.of(stepped[0]), stepped[1]
         if self.counters is not None and self.counters.loops:
             self.counters.after(self.glance().state)
         if self.recording is not None:
@@ -399,15 +412,7 @@ class Batch:
         if reasons and self.settings.device.type == "cpu":  # elsewhere it is told from the worlds where the action ends
             for row in np.flatnonzero(np.asarray(outcome.terminated.any(-1))).tolist():
                 self._reasons[row] = self.crash_reason(row)
-        return outcome
-
-    def _stepped(self, action: Tensor | np.ndarray | None, live: Tensor | None, observed: bool) -> Outcome:
-        if self._values is not None and not self.task.simulator.untried:
-            outputs = self._step_values(action, live)
-            if outputs is not None:
-                return Outcome.of(outputs)
-        with torch.no_grad() if self.settings.output == "numpy" else contextlib.nullcontext():
-            return Outcome.of(self._step_torch(action, live, observed))
+        return outcome, done
 
     def _step_torch(self, action: Tensor | np.ndarray | None, live: Tensor | None, observed: bool) -> dict[str, Any]:
         if isinstance(action, np.ndarray):
@@ -422,9 +427,12 @@ class Batch:
         outputs = {name: x.clone() for name, x in outputs.items()}
         return {n: x.cpu().numpy() for n, x in outputs.items()} if self.settings.output == "numpy" else outputs
 
-    def _step_values(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> dict[str, Any] | None:
-        """Return what is told of a step by compiled loops; None, with nothing changed, where there are none."""
-        values, world = self._values, self._world
+    def _step_values(self, action: Any, live: Tensor | None, steps: int) -> tuple[dict[str, Any], int] | None:
+        """Return the outputs of steps by compiled loops, and their number; None, with nothing changed, without loops.
+
+        Of several rewards are summed, and the rest is that of the last one.
+        """
+        values, world = self.values, self._world
         assert values is not None
         if self.settings.output == "torch" and dispatch.surroundings() is not None:
             self._world, self._loaded = self.world, False
@@ -433,10 +441,15 @@ class Batch:
         try:
             if world is not None and not self._loaded:
                 values.load(world)
-            normals = self._normals(values.clock)
-            noise = None if normals is None else self._drawn
             who = None if live is None else live.numpy().reshape(-1)
-            outputs = values.step(action, who, noise, max(self.used - 1, 0), self.episode_params())
+            if steps > 1:
+                left, noise = self.ahead()
+                rows = values.hold(action, who, noise, self.used, self.episode_params(), min(steps, left))
+                outputs, steps = _summed(*rows), rows[1]
+                self.used += steps
+            else:
+                noise = None if self._normals(values.clock) is None else self._drawn
+                outputs = values.step(action, who, noise, max(self.used - 1, 0), self.episode_params())
         except Untraceable as why:
             self._world, self._loaded = self.world, False
             self.used, self._block = used, block
@@ -444,19 +457,19 @@ class Batch:
                 # Where an effect is why it was said before (``kernels.printed``); NaN the step itself tells.
                 if self.settings.output == "torch" or self._several:
                     warnings.warn(f"no compiled step, the torch path runs instead: {why}.", stacklevel=4)
-                self._values = None
+                self.values = None
             return None
         # What is told is written to by whom it pleases.
         seen = outputs["observation"]
         self._world, self._loaded, self._seen = None, True, seen.clone() if isinstance(seen, Tensor) else seen.copy()
-        return outputs
+        return outputs, steps
 
     def detach(self) -> None:
         """Cut the graph behind the present state, for truncated back-propagation."""
         if isinstance(self._seen, Tensor):
             self._seen = self._seen.detach()
-        if self._world is None and self._loaded and self._values is not None:
-            self._values.detach()
+        if self._world is None and self._loaded and self.values is not None:
+            self.values.detach()
             return
         if self.world is not None:
             self.world = mapped(lambda x: x.detach(), self.world)
@@ -465,9 +478,9 @@ class Batch:
         """Leave out the graph: a copy, or what is pickled, goes on from the present worlds."""
         world = self.world
         cut = None if world is None else mapped(lambda x: x.detach(), world)
-        return {**self.__dict__, "_world": cut, "_loaded": False, "_values": None, "_seen": None, "_driven": None}
+        return {**self.__dict__, "_world": cut, "_loaded": False, "values": None, "_seen": None, "_driven": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take over everything, with loops of its own."""
         self.__dict__.update(state)
-        self._values = self._compiled()
+        self.values = self._compiled()

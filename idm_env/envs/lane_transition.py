@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from idm_env.compiled.kernels import lane_change_loops
-from idm_env.compiled.kernels.lane_changes import decision, rows_of
+from idm_env.compiled.kernels.lane_changes import Deciding, decision, rows_of
 from idm_env.compiled.kernels.lanes import static_of
 from idm_env.compiled.kernels.operands import operand
 from idm_env.compiled.kernels.rows import RowFunction, adjoint, storage
@@ -66,6 +66,7 @@ class Stage:
         self.plan, self.more, self._many = plan, tuple(more), many
         self._function, self._examples = function, examples
         self.loops = RowFunction(self._then, examples, many)
+        self._forward: tuple[Any, Any] = None, None
 
     def _then(self, **leaves: Tensor) -> dict[str, Tensor]:
         return {f"then_{n}": x for n, x in self._function(**leaves).items()}
@@ -90,8 +91,9 @@ class Stage:
 
     def run(self, still: Mapping[str, Array], rows: Array, own: Mapping[str, int], *begins: int) -> None:
         """Change some rows (indices): blocks and whole numbers before it, and those after it, begin there."""
-        groups = self.plan.groups("") + self.plan.groups("then_")
-        lane_change_loops.each_row(self.loops.call, rows, RowTable(self.loops, still, groups).filled(own, *begins))
+        if self._forward[0] is not still:
+            self._forward = still, RowTable(self.loops, still, self.plan.groups("") + self.plan.groups("then_"))
+        lane_change_loops.each_row(self.loops.call, rows, self._forward[1].filled(own, *begins))
 
     def through(
         self, still: Mapping[str, Array], rows: Array, own: Mapping[str, int], begins: Sequence[int], on: Array
@@ -170,16 +172,12 @@ class LaneTables(Tables):
 
         rows, places = rows_of(wishes.slots, find)
         which, offsets = np.array(blocks, np.int64).reshape(-1, 2).T
-        return rows, places, which, offsets, inputs, marks, wishes.compiled(plan.real.name)
+        return rows, places, which, offsets, inputs, marks
 
     def _source(self, name: str) -> tuple[Array | str | int, tuple[int, int, int]]:
         """Return an array, the name of what is given with every step, or the number of a block; and its strides."""
-        plan, loops, own, by_vehicle = (
-            self.plan,
-            self.plan.commands.loops,
-            name.replace(" ", "_"),
-            (0, self.plan.size, 1),
-        )
+        plan, loops, by_vehicle = self.plan, self.plan.commands.loops, (0, self.plan.size, 1)
+        own = name.replace(" ", "_")
         block = f"memory_{name.removeprefix('memory of ')}" if name.startswith("memory of ") else f"state_{name}"
         if block in self.layout.blocks:
             return self.layout.blocks.index(block), by_vehicle
@@ -203,9 +201,7 @@ class LaneTransition(CompiledTransition):
 
     worlds = ("", "mid_")
 
-    def __init__(
-        self, moves: Moves, world: EnvState, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
-    ) -> None:  # fmt: skip
+    def __init__(self, moves: Moves, world: EnvState, *others: Any) -> None:
         simulator, road = moves.task.simulator, moves.task.simulator.road
         assert isinstance(road, Lanes)
         self.road = road
@@ -215,13 +211,11 @@ class LaneTransition(CompiledTransition):
             raise Untraceable("an effect looks back, where vehicles change lanes")
         self.ring = float(self.road.ring or 0.0)
         self._whole = [n for n in WHOLE if n in named(world)]
-        super().__init__(moves, world, layout, kind, draws)
-        self.tables = np.array([self.road.table(name) for name in ("opens", "closes", "stops")], self.real)
+        super().__init__(moves, world, *others)
+        self.deciding = Deciding(simulator, self.rows, self.size, self.real)
         self._absent = np.empty(0, self.real)
         self._turns: dict[WholeStep, Stage] = {}
-        turns = simulator.decides_in_blocks
-        self.turns = simulator.turns(self.size).numpy() if turns else np.empty(0, np.int64)
-        self._stages = np.unique(self.turns) if turns else np.zeros(1, np.int64)
+        self._stages = np.unique(self.deciding.turns) if simulator.decides_in_blocks else np.zeros(1, np.int64)
         self._spare: Tensor | None = None
 
     def groups(self, prefix: str) -> tuple[Group, ...]:
@@ -339,7 +333,7 @@ class LaneTransition(CompiledTransition):
     def _decide(self, moment: Moment, bound: LaneTables, stages: Array, begins: Sequence[int]) -> None:
         """Let vehicles change lanes, in the worlds after some have come and gone."""
         lanes = moment.crossing
-        plan, places, which, offsets, inputs, marks, (phase_at, constants) = bound.decides
+        plan, places, which, offsets, inputs, marks = bound.decides
         plan[which, lane_change_loops.ADDRESS] = offsets + lanes.mid.data_ptr()
         bound.clock[:] = moment.clock
         if inputs:
@@ -349,18 +343,12 @@ class LaneTransition(CompiledTransition):
                 plan[i, lane_change_loops.ADDRESS] = moment.given[name] if where is None else address(where)
         if not self.ring:
             lane_change_loops.mark_led(lanes.decided, self.size, *lanes.whole_mid[1:3], marks["led"], marks["leads"])
-        lanes.fresh = np.zeros(self.count, np.uint8)
-        lanes.merger = np.tile(np.arange(self.size), self.rows if self.task.simulator.sees_mergers else 0)
-        order, begin = np.empty(self.count, np.int64), np.empty(self.rows * (self.road.count + 1), np.int64)
         blocks = dict(zip(self.layout.blocks, lanes.mid.view(len(lanes.mid), -1).numpy(), strict=True))
-        coming = "state_present" in blocks
-        if not lane_change_loops.decide(
-            lanes.whole_mid[: len(LINKS)], blocks["state_position"], blocks.get("state_present", self._absent), coming,
-            lanes.decided, stages, self.size, self.road.count, self.ring, self.road.handed == "left", self.tables,
-            plan, places, phase_at, constants, len(self.wishes.slots), lanes.fresh, lanes.merger, self.turns, order,
-            begin,
-        ):  # fmt: skip
+        world = lanes.whole_mid[: len(LINKS)], blocks["state_position"], blocks.get("state_present", self._absent)
+        choices = self.deciding.decide(self.wishes, world, (lanes.decided, stages), (plan, places))
+        if choices is None:
             raise Unordered("links are not the order of positions")
+        lanes.fresh, lanes.merger = choices[:2]
 
     # -- backwards -----------------------------------------------------------------------------------------------
 

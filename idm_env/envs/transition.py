@@ -26,24 +26,14 @@ from idm_env.compiled.scalar.record import Unordered, Untraceable
 from idm_env.delay_buffer import PAST
 from idm_env.envs.moves import Moves
 from idm_env.envs.past import ROOM
-from idm_env.envs.worlds import (
-    WHOLE,
-    Array,
-    Group,
-    Layout,
-    Moment,
-    Room,
-    RowTable,
-    address,
-    examples_of,
-    named,
-    world_of,
-)  # fmt: skip
+from idm_env.envs.worlds import WHOLE, Array, Layout, Moment, Room, RowTable, address, named, row_addresses, world_of
 from idm_env.tasks import EnvState
 from idm_env.types import Params, State
 
 _ROWS = (1009, 1013, 1019, 1021, 1031)
 """Numbers of rows of a recording: one that is no other dimension tells rows apart from everything else."""
+_BLOCK, _PAST = 64, ("past", "then_past")
+"""Rows that do all steps of an action before the next ones, and what steps read and write of the past."""
 
 Form = tuple[tuple[str, str, bool, bool], ...]
 """Parameters as a recording knows them: effect, name, whether vehicles differ, and whether a gradient is wanted."""
@@ -64,7 +54,9 @@ class WholeStep:
         size, agents = like.speed.shape[-1], len(task.agents)
         many = self.many = next(p for p in _ROWS if p not in (size, agents))
         real = like.speed.dtype
-        self.sample = inputs = examples_of(world, many)
+        self.sample = inputs = {
+            n: x.detach()[:1].expand(many, *x.shape[1:]).contiguous() for n, x in named(world).items()
+        }
         # On several lanes vehicles drive in the worlds after decisions: agents have commanded in those before.
         self.changing = [] if like.lanes is None else [*blocks, *(n for n in WHOLE if n in inputs)]
         inputs = inputs | {f"mid_{n}": inputs[n].clone() for n in self.changing}
@@ -199,13 +191,19 @@ class Tables:
         return RowTable(self.recorded.forward, self.still | self.room.arrays, self._forward)
 
     @cached_property
+    def together(self) -> tuple[Tensor, dict[str, Array], dict[str, Array]]:
+        """Memory for the steps of one action: worlds, what is told after each ``[steps, …]``, and where that begins."""
+        steps, world = self.plan.task.held, (len(self.layout.blocks), self.plan.rows, self.plan.size)
+        outputs, numbers = self.room.take(steps), np.arange(steps)
+        places = {n: row_addresses(x, numbers) for n, x in outputs.items()}
+        return torch.from_numpy(np.empty((steps, *world), self.plan.real)), outputs, places
+
+    @cached_property
     def back(self) -> RowTable:
         """The table of the adjoint."""
         pitch, blocks = self.plan.pitch, self.layout.blocks
-        groups: list[Group] = [
-            (prefix, blocks, pitch) for prefix in ("on_then_", *(f"to_{n}" for n in self.plan.worlds))
-        ]
-        groups = [*self.plan.before, *groups, ("to_", self.recorded.wanted, pitch)]
+        groups = [(prefix, blocks, pitch) for prefix in ("on_then_", *(f"to_{n}" for n in self.plan.worlds))]
+        groups = [*self.plan.before, *groups, ("to_", tuple(self.recorded.wanted), pitch)]  # type: ignore[list-item]
         return RowTable(self.recorded.backward, self.still, groups)
 
     def with_values(self, values: Sequence[Tensor]) -> dict[str, dict[str, Tensor]]:
@@ -254,9 +252,9 @@ class CompiledTransition:
         self._bound: Tables | None = None
         self._normals: dict[str, tuple[Array, int]] = {}
         self.threads = 1 if self.count < 2 * pool.GRAIN else pool.count(self.count)
-        self.before: tuple[Group, ...] = tuple(group for prefix in self.worlds for group in self.groups(prefix))
+        self.before = tuple(group for prefix in self.worlds for group in self.groups(prefix))
 
-    def groups(self, prefix: str) -> tuple[Group, ...]:
+    def groups(self, prefix: str) -> tuple[tuple[str, Sequence[str], int], ...]:
         """Return how worlds lie, whose leaves have names that begin so."""
         return ((prefix, self.layout.blocks, self.pitch),)
 
@@ -296,9 +294,31 @@ class CompiledTransition:
         moment.given = self.pointers(moment)
         moment.begins = self.begins(moment, now, later.data_ptr(), tape)
         self.split(bound.recorded.forward, bound.once.pointer(moment.given, moment.begins))
-        if self.task.simulator.own and bool(later[bound.layout.blocks.index("state_speed")].isnan().any()):
-            raise Untraceable("an effect returned nan: the step itself tells which")
+        self.refuse_nan(later)
         return bound.room.copied()
+
+    def refuse_nan(self, worlds: Tensor) -> None:
+        """Raise Untraceable where an effect of the user's own returned NaN: blocks ``[…, blocks, rows, vehicles]``."""
+        if self.task.simulator.own and bool(worlds[..., self.layout.blocks.index("state_speed"), :, :].isnan().any()):
+            raise Untraceable("an effect returned nan: the step itself tells which")
+
+    def run_together(self, moment: Moment, now: Tensor, first: int, steps: int) -> None:
+        """Do some steps under one action, of which only the first changes lanes; ``first`` is its number in memory."""
+        bound, part, count = moment.bound, slice(first, first + steps), np.arange(steps)
+        worlds, _, places = bound.together
+        cells = self.spread(moment, count) | {n: x[part] for n, x in places.items()}
+        cells["state_step"][1:] = cells["clock"][:-1]
+        later = worlds.data_ptr() + (first + count) * (worlds.shape[1] * self.pitch)
+        begins = np.concatenate(([now.data_ptr()], later[:-1]))
+        table = bound.ahead.filled(cells, *self.columns(moment, now, begins, later))
+        loops, tables = bound.recorded.forward, range(address(table), address(table) + table.nbytes, table[0].nbytes)
+
+        def some(begin: int, end: int) -> None:
+            for low in range(begin, end, _BLOCK):  # what they read and write stays in the cache
+                for where in tables:
+                    loops.run(low, min(low + _BLOCK, end), where)
+
+        pool.split(some, self.rows, 1, self.threads)
 
     def begins(self, moment: Moment, now: Tensor, later: int, tape: bool) -> tuple[int, ...]:
         """Return where the worlds of a step begin (``before``), and those after it."""
@@ -337,6 +357,12 @@ class CompiledTransition:
             pointers["past"] = address(moment.past) + moment.newest * self.slot
             pointers["then_past"] = pointers["past"] - self.slot
         return pointers
+
+    def spread(self, moment: Moment, count: Array) -> dict[str, Array]:
+        """Return the addresses of what steps are given that come ``count`` steps after the first one."""
+        moment.given = self.pointers(moment)
+        apart = {f"normal_{n}": self.pitch for n in moment.normals or ()} | dict.fromkeys(_PAST, -self.slot)
+        return {n: x + count * apart.get(n, 0) for n, x in moment.given.items()}
 
     # -- backwards -----------------------------------------------------------------------------------------------
 

@@ -33,7 +33,8 @@ _WORTHWHILE = 64
 class Values:
     """The worlds of a batch as arrays, and their steps.
 
-    ``graph`` says that steps may have a graph; then nothing that a step has read is written to later.
+    ``graph`` says that steps may have a graph; then nothing that a step has read is written to later. ``whole`` are
+    whole numbers ``(WHOLE, rows · vehicles)`` of all rows, as they are now, on a road of several lanes.
 
     Raises:
         Untraceable: From ``load`` and ``step``, before anything has changed, where the task, its simulator or what
@@ -51,10 +52,11 @@ class Values:
         self._spare: Tensor | None = None
         self._token: Tensor | None = None
         self._clock: Array
-        self._whole: Array | None = None
+        self.whole: Array | None = None
         self.past: Past
         self._world: EnvState
         self._glance: EnvState | None = None
+        self._views: tuple[Layout | None, dict[str, Tensor]] = None, {}
 
     # -- worlds --------------------------------------------------------------------------------------------------
 
@@ -75,7 +77,7 @@ class Values:
         still = {n: np.array(x.numpy(), order="C").reshape(-1) for n, x in leaves.items() if n not in blocks}
         self._clock = still.pop("state_step")
         whole = [still.pop(n) for n in WHOLE if n in still]
-        self._whole = np.stack(whole) if whole else None
+        self.whole = np.stack(whole) if whole else None
         old = self.layout.still
         if still.keys() != old.keys() or not all(np.array_equal(x, old[n]) for n, x in still.items()):
             self.layout = Layout(blocks, still, self.layout.version + 1)
@@ -100,10 +102,10 @@ class Values:
             self.blocks[:, index] = blocks
         self._clock[rows] = leaves["state_step"]
         self.past.replace(rows, fresh.state)
-        if self._whole is not None:
-            self._whole = self._whole.copy()
+        if self.whole is not None:
+            self.whole = self.whole.copy()
             for i, name in enumerate(n for n in WHOLE if n in leaves):
-                self._whole[i].reshape(len(self._clock), -1)[rows] = leaves[name]
+                self.whole[i].reshape(len(self._clock), -1)[rows] = leaves[name]
         for name, held in self.layout.still.items():
             values = leaves[name]
             old = held.reshape(len(self._clock), *values.shape[1:])
@@ -119,28 +121,25 @@ class Values:
     def current(self) -> EnvState:
         """Return the worlds as tensors of their own."""
         layout = self.layout._replace(still={n: x.copy() for n, x in self.layout.still.items()})
-        whole = None if self._whole is None else self._whole.copy()
+        whole = None if self.whole is None else self.whole.copy()
         past = self.past.tensor() if self.past.slots else None
         if past is not None and self._token is not None:
             past = _Leave.apply(self._token, past)
         held = self.blocks if self._graph else self.blocks.clone()
-        return _world(self._world, layout, held, self._clock.copy(), past, whole)
+        return _world(self._world, layout, _views(self._world, layout), held, self._clock.copy(), past, whole)
 
     def glance(self) -> EnvState:
         """Return the worlds as views until the next step, without graph and past: the same until then."""
         if self._glance is None:
+            if self._views[0] is not self.layout:
+                self._views = self.layout, _views(self._world, self.layout)
             held = self.blocks.detach()
-            self._glance = _world(self._world, self.layout, held, self._clock, None, self._whole)
+            self._glance = _world(self._world, *self._views, held, self._clock, None, self.whole)
         return self._glance
 
     def detach(self) -> None:
         """Cut the graph behind the worlds."""
         self.blocks, self._token, self._glance = self.blocks.detach(), None, None
-
-    @property
-    def whole(self) -> Array | None:
-        """Whole numbers ``(WHOLE, rows · vehicles)`` of all rows, as they are now, on a road of several lanes."""
-        return self._whole
 
     def clock(self) -> Tensor:
         """Return the steps of all rows, as they are now."""
@@ -164,7 +163,7 @@ class Values:
         if self.past.slots:
             self.past.room()
         past = self.past
-        moment = Moment(self._clock, command, live, normals, at, past.numbers, past.newest, bound, self._whole)
+        moment = Moment(self._clock, command, live, normals, at, past.numbers, past.newest, bound, self.whole)
         outputs: dict[str, Any]
         if self._graph and torch.is_grad_enabled() and self._differentiated(action, bound):
             outputs = self._noted(plan, moment, action, bound)
@@ -178,15 +177,45 @@ class Values:
                 outputs = {n: torch.from_numpy(x) for n, x in outputs.items()} | {"clock": clock}
         self._clock, self._glance = outputs.pop("clock"), None
         if moment.crossing is not None:
-            self._whole = moment.crossing.later[0]
+            self.whole = moment.crossing.later[0]
         if self.past.slots:
             self.past.newest -= 1
         return outputs
 
+    def hold(
+        self, action: Array | None, live: Array | None, normals: Mapping[str, Array] | None, at: int, params: Params,
+        steps: int,
+    ) -> tuple[dict[str, Array], int]:  # fmt: skip
+        """Advance all rows under one action by some steps at once, or until somebody's episode is over; no graph.
+
+        As ``step``; returns what is told after each of them ``[steps, rows, …]``, until the next call, and how many
+        were done: at least one.
+        """
+        plan, past = self.plan((action is None, live is None), tuple(normals or ())), self.past
+        bound = plan.of(self.layout, params)
+        steps = min(steps, past.room()) if past.slots else steps
+        (worlds, outputs, _), done, whole = bound.together, 0, list[Array | None]()
+        now, clock, lanes = self.blocks, self._clock, self.whole
+        while done < steps:
+            count = min(steps - done, 1 + plan.until(clock + 1))
+            moment = Moment(clock, action, live, normals, at + done, past.numbers, past.newest - done, bound, lanes)
+            plan.run_together(moment, now, done, count)
+            whole += [None] * count if moment.crossing is None else moment.crossing.later
+            done += count
+            now, clock, lanes = worlds[done - 1], outputs["clock"][done - 1], whole[-1]
+        over = (outputs["whole_terminated"] | outputs["whole_truncated"])[:steps].any(1)
+        done = int(over.argmax()) + 1 if over.any() else steps
+        plan.refuse_nan(worlds[:done])
+        later = self._spare if self._spare is not None else torch.empty_like(self.blocks)
+        self._spare = self.blocks
+        past.newest -= done if past.slots else 0
+        self.arrive(later.copy_(worlds[done - 1]), outputs["clock"][done - 1].copy(), whole=whole[done - 1])
+        return outputs, done
+
     def arrive(self, blocks: Tensor, clock: Array, token: Tensor | None = None, whole: Array | None = None) -> None:
         """Go on from other worlds of the same episodes; whole numbers stay, where there are no others."""
         self.blocks, self._clock, self._token, self._glance = blocks, clock, token, None
-        self._whole = self._whole if whole is None else whole
+        self.whole = self.whole if whole is None else whole
 
     def token_of(self, plan: CompiledTransition) -> Tensor | None:
         """Return the token that stands for the past, if there is one."""
@@ -197,11 +226,11 @@ class Values:
     def mark(self) -> tuple[Any, ...]:
         """Return what ``back_to`` goes back to."""
         past = self.past
-        return self.blocks, self._clock, self._whole, self._token, self.layout, past, past.numbers, past.newest
+        return self.blocks, self._clock, self.whole, self._token, self.layout, past, past.numbers, past.newest
 
     def back_to(self, mark: tuple[Any, ...]) -> None:
         """Go back to the worlds as they were: steps have written nothing that these read."""
-        self.blocks, self._clock, self._whole, self._token, self.layout, self.past, *past = mark
+        self.blocks, self._clock, self.whole, self._token, self.layout, self.past, *past = mark
         (self.past.numbers, self.past.newest), self._glance = past, None
 
     def plan(self, kind: tuple[bool, bool], draws: tuple[str, ...], steps: int = 1) -> CompiledTransition:
@@ -294,7 +323,7 @@ def _twice(
         recent = moment.past[:, moment.newest : moment.newest + plan.past_shape[1]]
         past = torch.from_numpy(recent.copy()).movedim(-1, 1)
         past = past if token is None else _Leave.apply(token, past)
-    world = _world(plan.world, layout, blocks, moment.clock, past, moment.whole)
+    world = _world(plan.world, layout, _views(plan.world, layout), blocks, moment.clock, past, moment.whole)
     live = None if moment.live is None else torch.from_numpy(moment.live).view(shape[0], -1)
     normals = {n: torch.from_numpy(x).view(-1, *shape)[moment.at] for n, x in (moment.normals or {}).items()} or None
     after, outcome = plan.moves.step(world, action, live, normals, moment.bound.with_values(parameters))
@@ -310,18 +339,21 @@ def _twice(
     return tuple(next(gradients) if flows else None for flows in differentiated)
 
 
+def _views(like: EnvState, layout: Layout) -> dict[str, Tensor]:
+    """Return constant leaves of worlds as tensors of their shapes that share the memory of the layout."""
+    return {n: torch.from_numpy(layout.still[n]).view(x.shape) for n, x in named(like).items() if n in layout.still}
+
+
 def _world(
-    like: EnvState, layout: Layout, blocks: Tensor, clock: Array, past: Tensor | None, whole: Array | None = None
+    like: EnvState, layout: Layout | None, still: Mapping[str, Tensor], blocks: Tensor, clock: Array,
+    past: Tensor | None, whole: Array | None = None,
 ) -> EnvState:  # fmt: skip
     """Return worlds as tensors that share the memory given."""
-    leaves = dict(zip(layout.blocks, blocks, strict=True))
+    assert layout is not None
+    leaves = {**still, **dict(zip(layout.blocks, blocks, strict=True))}
+    leaves["state_step"] = torch.from_numpy(clock).view(like.state.step.shape)
     if whole is not None:
-        shape = like.state.speed.shape
-        leaves |= {n: torch.from_numpy(x).view(shape) for n, x in zip(WHOLE, whole, strict=False)}
-    for name, x in named(like).items():
-        if name not in leaves:
-            array = clock if name == "state_step" else layout.still[name]
-            leaves[name] = torch.from_numpy(array).view(x.shape)
+        leaves |= dict(zip(WHOLE, torch.from_numpy(whole).view(-1, *like.state.speed.shape), strict=False))
     state, episode = world_of(leaves, like)
     return EnvState(state if past is None else state._replace(memory={**state.memory, PAST: past}), episode)
 

@@ -24,7 +24,7 @@ from idm_env.compiled.scalar.record import Untraceable
 from idm_env.envs.policy_call import NO_NUMBERS, policy_outputs
 from idm_env.envs.transition import CompiledTransition, Tables
 from idm_env.envs.values import token_like
-from idm_env.envs.worlds import Array, Moment, address
+from idm_env.envs.worlds import Array, Moment, address, row_addresses
 
 if TYPE_CHECKING:
     from idm_env.envs.batch import Batch
@@ -165,11 +165,6 @@ class _Segment(NamedTuple):
     pointers: dict[str, Array]
 
 
-def _each(x: Array, numbers: Array) -> Array:
-    """Return the addresses of some elements of an array, by their numbers."""
-    return address(x) + numbers * (x.nbytes // len(x))
-
-
 def _columns(loops: RowFunction, pointers: Mapping[str, Any], steps: int) -> Array:
     """Return tables of the loops of a policy, one for each step."""
     columns = np.empty((steps, len(loops.table({}))), np.int64)
@@ -211,20 +206,6 @@ class Tape:
         self._blocks = -(-rows // BLOCK)
         self._threads = 1 if plan.count * AHEAD < 2 * pool.GRAIN else pool.count(plan.count * AHEAD)
 
-    def pointers(self, steps: Array, batch: Batch, values: Values) -> dict[str, Array]:
-        """Return the addresses of the inputs of steps, beside their worlds."""
-        plan, past, count, decided = self.plan, values.past, steps - steps[0], steps // self.held
-        _, normals = batch.ahead()
-        self.held_memory += [normals, past.numbers]
-        pointers: dict[str, Array] = {
-            f"normal_{n}": address(x) + (batch.used + count) * plan.pitch for n, x in (normals or {}).items()
-        }
-        if past.slots:
-            pointers["past"] = address(past.numbers) + (past.newest - count) * plan.slot
-            pointers["then_past"] = pointers["past"] - plan.slot
-        pointers["live"] = _each(self.on_road, decided * self.held)
-        return pointers | {"action": _each(self.action, decided), "state_step": _each(self.clocks, steps)}
-
     def run(self, batch: Batch, values: Values, weights: Mapping[str, Array]) -> None:
         """Do all steps; episodes that end begin anew with the next action."""
         plan, held, done = self.plan, self.held, 0
@@ -238,17 +219,24 @@ class Tape:
             ahead = min(ahead, held - done % held) if done % held else ahead
             part = slice(done, min(self.steps, done + ahead))
             steps = np.arange(part.start, part.stop, dtype=np.int64)
-            bound, pointers = plan.of(values.layout, batch.episode_params()), self.pointers(steps, batch, values)
-            own: dict[str, Any] = {n: _each(x, steps // held) for n, x in decides.items()}
+            bound, decided, (_, normals) = plan.of(values.layout, batch.episode_params()), steps // held, batch.ahead()
+            past, clock, now = values.past, self.clocks[done], done // held
+            moment = Moment(
+                clock, self.action[now], self.on_road[now * held], normals, batch.used, past.numbers, past.newest,
+                bound, values.whole,
+            )  # fmt: skip
+            self.held_memory += [normals, past.numbers]
+            pointers = plan.spread(moment, steps - done) | {"state_step": row_addresses(self.clocks, steps)}
+            pointers |= {"live": row_addresses(self.on_road, decided * held)}
+            pointers |= {"action": row_addresses(self.action, decided)}
+            own: dict[str, Any] = {n: row_addresses(x, decided) for n, x in decides.items()}
             own |= {n: address(x) for n, x in weights.items()} | {"push": address(self.push)} | pointers
             acts = _columns(self.driver.forward, own, len(steps))
-            moment = Moment(self.clocks[done], None, None, None, 0, values.past.numbers, 0, bound, values.whole)
-            moment.given = {n: int(x[0]) for n, x in pointers.items()}
             if done % held == 0 and plan.until(moment.clock) == 0:
                 self.driver.forward.run(0, plan.rows, address(acts))
             worlds = plan.columns(moment, values.blocks, self.now[part], self.later[part])
-            to = pointers | {n: _each(x, steps) for n, x in self.outputs.items()}
-            to |= {"clock": _each(self.clocks[1:], steps), "on_road": _each(self.on_road[1:], steps)}
+            to = pointers | {n: row_addresses(x, steps) for n, x in self.outputs.items()}
+            to |= {"clock": row_addresses(self.clocks[1:], steps), "on_road": row_addresses(self.on_road[1:], steps)}
             count = self._ahead(bound, acts, bound.ahead.filled(to, *worlds), part)
             self.segments.append(_Segment(done, done + count, moment, worlds[: len(plan.before)], pointers))
             batch.used += count
@@ -343,15 +331,16 @@ class Tape:
             side = numbers % 2
             falls: dict[str, Any] = {f"on_{n}": address(plan.zeros) for n in recorded.flowing}
             falls |= {n: x[: last - first] for n, x in pointers.items()}
-            falls |= {"on_observation": address(on_observation), "on_whole_reward": _each(on_reward, numbers)}
+            falls |= {"on_observation": address(on_observation), "on_whole_reward": row_addresses(on_reward, numbers)}
             falls |= {"to_action": address(done)}
             falls |= {"on_past": address(pasts[0]) + (1 - side) * pasts[0].nbytes}
             falls |= {"to_past": address(pasts[0]) + side * pasts[0].nbytes}
             begins, seeds = (address(two) + k * two[0].nbytes for k in (side, 1 - side))
             constant = (np.full(len(side), address(x)) for x in (*mid, each))
             asks = moment.bound.back.filled(falls, *(x[: last - first] for x in before), seeds, begins, *constant)
-            see = {"seen": _each(self.seen, numbers // held), "push": address(self.push)}
-            see |= {"on_action": _each(acted, numbers // held), "hidden": _each(self.hidden, numbers // held)}
+            see = {"seen": row_addresses(self.seen, numbers // held), "push": address(self.push)}
+            see |= {"hidden": row_addresses(self.hidden, numbers // held)}
+            see |= {"on_action": row_addresses(acted, numbers // held)}
             see |= {n: address(x) for n, x in weights.items()} | {"to_seen": address(looked)}
             see |= {"on_later": address(on_later), "to_hidden": address(recalled)}
             shared = recorded.backward.call, asks, plan.rows, plan.size, held

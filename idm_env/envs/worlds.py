@@ -128,12 +128,6 @@ class Room:
         return {n: np.ndarray((steps, *shape), kind, memory[kind], begin * steps) for n, kind, begin, shape in self._at}
 
 
-def examples_of(world: EnvState, many: int) -> dict[str, Tensor]:
-    """Return the leaves of many worlds like the first of these."""
-    leaves = {n: x.detach() for n, x in named(world).items()}
-    return {n: x[:1].expand(many, *x.shape[1:]).contiguous() for n, x in leaves.items()}
-
-
 def named(world: EnvState) -> dict[str, Tensor]:
     """Return the tensors of a world by names that can stand in a program; the past is not among them."""
     state = world.state
@@ -160,6 +154,11 @@ def world_of(own: Mapping[str, Tensor], like: EnvState) -> EnvState:
         state = state._replace(lanes=lanes)
     memory = {n: own.get(f"memory_{n}", x) for n, x in state.memory.items()}
     return EnvState(state._replace(memory=memory), episode)
+
+
+def row_addresses(x: Array, numbers: Array) -> Array:
+    """Return where some elements of an array begin, by their numbers along its first dimension."""
+    return address(x) + numbers * (x.nbytes // len(x))
 
 
 def address(x: Array | None) -> int:

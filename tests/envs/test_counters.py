@@ -62,7 +62,7 @@ def test_detectors_and_stops_are_a_count_by_hand(compiled, output):
     each, held = (gym.make("DiffIDM-v0", **made, hold=hold) for hold in (0.1, 1.0))
     for env in (each, held):
         if not compiled:
-            env.unwrapped.batch._values = None
+            env.unwrapped.batch.values = None
         env.reset(seed=3)
     states = [each.unwrapped.state]
     for _ in range(STEPS):

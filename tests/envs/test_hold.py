@@ -72,7 +72,7 @@ def test_rows_that_end_while_an_action_is_held_tell_of_their_end() -> None:
 def test_observations_are_read_once_a_decision(output: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """By torch, where every reading costs as much as a step; and where a row ends in between."""
     env = gym.make_vec("DiffIDM-v0", num_envs=2, task="merge", vehicles=12, output=output)
-    env.unwrapped.batch._values = None
+    env.unwrapped.batch.values = None
     env.reset(seed=3)
     task, read = env.unwrapped.task, []
     observe = type(task).observe

@@ -96,7 +96,7 @@ def made(case, eager, **more):
     task, keywords = CASES[case]
     env = DiffIDMVectorEnv(3, task=task, dtype="float64", output="torch", **{**keywords, **more})
     if eager:
-        env.batch._values = None
+        env.batch.values = None
     return env
 
 
@@ -144,7 +144,7 @@ def test_gradients_are_those_of_the_torch_path_and_of_differences(case):
         found = torch.autograd.grad(total, own, allow_unused=True)
         found = [torch.zeros_like(x) if g is None else g for g, x in zip(found, own, strict=True)]
         results.append((total.detach(), found))
-        assert (env.batch._values is None) == eager, "the other path ran"
+        assert (env.batch.values is None) == eager, "the other path ran"
     assert ends or "max_episode_steps" not in CASES[case][1]
     (wanted, torchs), (value, found) = results
     torch.testing.assert_close(value, wanted, rtol=1e-10, atol=1e-9)
@@ -183,7 +183,7 @@ def test_gradients_after_single_agents_have_left(case):
             told = batch.step(0.3 + push, live.clone())
             total = total + told.observation.sum() + told.whole.reward.clamp(-20.0, 20.0).sum()
         results.append((total.detach(), *torch.autograd.grad(total, push)))
-        assert (batch._values is None) == eager, "the other path ran"
+        assert (batch.values is None) == eager, "the other path ran"
     for ours, theirs in zip(*results, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9 * float(theirs.abs().max() + 1.0))
     assert results[0][1].abs().min() > 0.0
@@ -211,7 +211,7 @@ def test_nothing_is_stepped_by_torch_and_values_are_the_same_bits_without_a_grap
     np.testing.assert_array_equal(graph, plain)
     np.testing.assert_array_equal(graph, arrays)
     # In mid-window: copies go on alike, without the graph; cutting the graph frees it.
-    tape = weakref.ref(env.batch._values.blocks.grad_fn)
+    tape = weakref.ref(env.batch.values.blocks.grad_fn)
     others = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
     action = torch.zeros(3, 1)
     mine = env.step(action)

@@ -61,7 +61,7 @@ INFOS = [*((*case, "all") for case in CASES), *((*CASES[i], "none") for i in (0,
 def test_a_single_environment_is_a_row_of_a_vector_and_the_torch_path(task, keywords, info):
     made = {"task": task, "dtype": "float64", "info": info, **keywords}
     single = [gym.make("DiffIDM-v0", output=o, **made) for o in ("numpy", "torch")]
-    single[1].unwrapped.batch._values = None
+    single[1].unwrapped.batch.values = None
     vector = gym.make_vec("DiffIDM-v0", num_envs=3, autoreset_mode="SameStep", **made)
     rows, _ = vector.reset(seed=4)
     for env in single:
@@ -82,7 +82,7 @@ def test_a_single_environment_is_a_row_of_a_vector_and_the_torch_path(task, keyw
         if ours[2] or ours[3]:
             _same(single[0].reset()[0], rows[0])
             single[1].reset()
-    compiled = single[0].unwrapped.batch._values is not None
+    compiled = single[0].unwrapped.batch.values is not None
     assert compiled, "the torch path ran"
     _same(single[0].unwrapped.state.gap, single[1].unwrapped.state.gap)
     _same(vector.unwrapped.state.speed[:1], single[1].unwrapped.state.speed)
@@ -92,7 +92,7 @@ def test_a_single_environment_is_a_row_of_a_vector_and_the_torch_path(task, keyw
 def test_vehicles_whose_agents_left_go_back_to_their_drivers(task, keywords):
     made = settings(task=task, dtype="float64", **keywords)
     ours, theirs = Batch(made, 2), Batch(made, 2)
-    theirs._values = None
+    theirs.values = None
     for batch in (ours, theirs):
         batch.seed([0, 1], [5, 6])
         batch.reset()
@@ -106,7 +106,7 @@ def test_vehicles_whose_agents_left_go_back_to_their_drivers(task, keywords):
         assert set(mine.details) == set(torchs.details) and not mine.details["command"][~live.numpy()].any()
         for name, value in torchs.details.items():
             _same(mine.details[name], value)
-    assert ours._values is not None, "the torch path ran"
+    assert ours.values is not None, "the torch path ran"
 
 
 def steps_of_torch(monkeypatch, **keywords):
@@ -186,7 +186,7 @@ def test_parameters_and_states_that_change_are_noticed():
 
 def test_it_can_be_switched_off(monkeypatch):
     def values(**keywords):
-        return isinstance(gym.make("DiffIDM-v0", warmup=1, **keywords).unwrapped.batch._values, Values)
+        return isinstance(gym.make("DiffIDM-v0", warmup=1, **keywords).unwrapped.batch.values, Values)
 
     assert values() and values(output="torch")
     with backends.off():
@@ -208,7 +208,7 @@ def test_several_lanes_are_compiled_from_the_first_step():
     """So is what a copy of an environment does."""
     task, keywords = LANES["highway"]
     ours, theirs = (gym.make("DiffIDM-v0", task=task, dtype="float64", **keywords) for _ in range(2))
-    theirs.unwrapped.batch._values = None
+    theirs.unwrapped.batch.values = None
     for env in (ours, theirs):
         env.reset(seed=2)
     action = np.full(ours.action_space.shape, 0.3)

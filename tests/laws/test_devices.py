@@ -85,7 +85,7 @@ def test_no_task_asks_a_tensor_for_its_value(task):
     batch = env.batch
     batch.settings = batch._moves.settings = dataclasses.replace(batch.settings, device=META)
     batch.world, batch.params, batch._draw = there(batch.world), there(batch.params), there(batch._draw)
-    batch._values = batch._driven = None
+    batch.values = batch._driven = None
     if batch.counters is not None:
         batch.counters.stops = there(batch.counters.stops)
         batch.counters.begin(np.arange(0), batch.world.state)

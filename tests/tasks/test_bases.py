@@ -66,7 +66,7 @@ def test_every_law_is_compiled(name: str) -> None:
             told = [env.step(np.full(1, 0.3 * (-1) ** step, np.float32)) for env in (ours, theirs)]
             for mine, torchs in zip(told[0][:4], told[1][:4], strict=True):
                 np.testing.assert_allclose(mine, torchs, rtol=1e-9, atol=1e-9, err_msg=law)
-        compiled = [env.unwrapped.batch._values is not None for env in (ours, theirs)]  # type: ignore[attr-defined]
+        compiled = [env.unwrapped.batch.values is not None for env in (ours, theirs)]  # type: ignore[attr-defined]
         assert compiled == [True, False], law
 
 

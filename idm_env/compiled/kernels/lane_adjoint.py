@@ -6,19 +6,8 @@ The states within a block live only in the workspace of a tile, so that the tape
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
-from idm_env.compiled.kernels import lane_loops as lane
+from idm_env.compiled.kernels import lane_loops, lane_loops as lane
 from idm_env.compiled.kernels.compiler import apart
-from idm_env.compiled.kernels.lane_loops import (
-    fetch_next,
-    fetch_states,
-    load_inputs,
-    load_past,
-    load_static,
-    look,
-    perceive,
-    step,
-    store_past,
-)
 from idm_env.compiled.kernels.memory import add, copy, fill, number
 from idm_env.compiled.kernels.phases import call
 from idm_env.compiled.kernels.tiles import ROW, exact, load, padded, place, send_ahead, send_back, uniform, workspace
@@ -64,9 +53,9 @@ def step_back(w, h, pitch, ah, n, size, measures, phases, back, looks, recalls, 
     ``now`` is the place of the step in the past at address ``h`` (see ``step``), ``then`` in its adjoint ``ah``.
     """
     m, signals = padded(n), measures[lane.SIGNALS]
-    perceive(w, h, pitch, n, size, measures, phases, looks, recalls, k, now)
+    lane_loops.perceive(w, h, pitch, n, size, measures, phases, looks, recalls, k, now)
     if measures[lane.NUMBERS] + measures[lane.FLAGS]:
-        look(w, n, size, measures, looks, lane.CLOSE)  # whose neighbour comes or goes is an input of this step
+        lane_loops.look(w, n, size, measures, looks, lane.CLOSE)  # who comes or goes is an input of this step
     for phase in (lane.CLOSE, lane.RESPOND):
         call(back[phase], w, m, k)  # type: ignore[call-arg]
         send(w, n, size, measures, sends, phase)
@@ -90,8 +79,8 @@ def recompute(
         # The last step's result is not needed, but what it senses is.
         if t + 1 < steps or phases[lane.SENSE]:
             if measures[lane.NUMBERS] + measures[lane.FLAGS]:
-                load_inputs(w, operands, strides, begin_step + t, row, first, n, size, measures)
-            step(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, slots + t)
+                lane_loops.load_inputs(w, operands, strides, begin_step + t, row, first, n, size, measures)
+            lane_loops.step(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, slots + t)
 
 
 @exact
@@ -132,17 +121,17 @@ def backward(
         cell = row * size + first + skip
         if tile + 1 < end:
             following = place(tile + 1, rows, size, wide, around, is_ring)
-            fetch_states(start, again, following, size, k)
-            fetch_next(operands, strides[:many], following, size, k)
-            fetch_next(on_end, on_strides, following, size, k)
+            lane_loops.fetch_states(start, again, following, size, k)
+            lane_loops.fetch_next(operands, strides[:many], following, size, k)
+            lane_loops.fetch_next(on_end, on_strides, following, size, k)
         for i in again:
             load(w, measures[lane.STATE_ROWS] + i * ROW, start[i], strides, dense, 0, row, first, n, size, False)
-        load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
+        lane_loops.load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
         filled = max(filled, n)
-        load_past(h, past, alike, 0, slots, signals, strides, row, first, n, size, count)
+        lane_loops.load_past(h, past, alike, 0, slots, signals, strides, row, first, n, size, count)
         if signals:
             fill(ah, 0, 0, len(ah))
-            load_past(ah, on_past_end, False, steps, slots, signals, strides, row, first, n, size, count)
+            lane_loops.load_past(ah, on_past_end, False, steps, slots, signals, strides, row, first, n, size, count)
         recompute(
             w, h, tape, taped, operands, strides, k, begin_step, steps, slots, row, first, n, size, measures, phases,
             looks, recalls,
@@ -160,7 +149,7 @@ def backward(
             for i in range(len(taped)):
                 copy(w, measures[lane.STATE_ROWS] + taped[i] * ROW, tape, (t * len(taped) + i) * ROW, n)
             if has_inputs:
-                load_inputs(w, operands, strides, now, row, first, n, size, measures)
+                lane_loops.load_inputs(w, operands, strides, now, row, first, n, size, measures)
             then = slots + t
             step_back(w, h.ctypes.data, ROW, ah, n, size, measures, phases, back, looks, recalls, sends, k, then, then)
             if over:
@@ -172,7 +161,7 @@ def backward(
         for i in range(measures[lane.MOVING]):
             if on_begin[i]:
                 copy(on_begin[i], cell, w, measures[lane.ON_ROWS] + i * ROW + skip, own)
-        store_past(ah, on_past, slots - 1, slots, signals, cell, skip, own, count)
+        lane_loops.store_past(ah, on_past, slots - 1, slots, signals, cell, skip, own, count)
         for i in range(measures[lane.PARAMETERS]):
             if fresh:
                 copy(on_parameters, i * count + cell, w, measures[lane.GRADIENT_ROWS] + i * ROW + skip, own)

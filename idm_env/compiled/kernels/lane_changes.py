@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -63,6 +63,46 @@ def _decision(simulator: CarFollowingStep, form: Form) -> Decision:
     return Decision(Wishes(simulator, form), f"One decision about lanes of {names}, {simulator.integration}.")
 
 
+class Choices(NamedTuple):
+    """Decisions of some rows: which vehicles have new leaders, mergers beside drivers, and the order of lanes.
+
+    ``fresh`` (bool), ``merger`` and ``order`` (slots) have shape ``(rows · n,)``, ``begin`` ``(rows · (lanes + 1),)``.
+    """
+
+    fresh: Array
+    merger: Array
+    order: Array
+    begin: Array
+
+
+class Deciding:
+    """Decisions about the lanes of ``rows`` of ``n`` slots, in numbers of a ``kind``."""
+
+    def __init__(self, simulator: CarFollowingStep, rows: int, n: int, kind: Any) -> None:
+        road = simulator.road
+        assert isinstance(road, Lanes)
+        self._rows, self._n, self._road, self._sees = rows, n, road, simulator.sees_mergers
+        self._tables = np.array([road.table(name) for name in ("opens", "closes", "stops")], kind)
+        self.turns = simulator.turns(n).numpy() if simulator.decides_in_blocks else np.empty(0, np.int64)
+
+    def decide(self, wishes: Decision, world: Any, turn: Sequence[Array], plan: Sequence[Array]) -> Choices | None:
+        """Change links in place; None where they are not the order of positions.
+
+        ``world`` are links ``(7, rows · n)``, positions, and presence ``(rows · n,)`` (empty: everybody is there),
+        ``turn`` the rows that decide, and their stages; ``plan`` as ``rows_of`` returns it.
+        """
+        size, lanes, road = self._rows * self._n, self._road.count, self._road
+        mergers = np.tile(np.arange(self._n), self._rows if self._sees else 0)
+        order, begin = np.empty(size, np.int64), np.empty(self._rows * (lanes + 1), np.int64)
+        choices = Choices(np.zeros(size, np.uint8), mergers, order, begin)
+        done = lane_change_loops.decide(
+            *world, len(world[2]) > 0, *turn, self._n, lanes, float(road.ring or 0.0), road.handed == "left",
+            self._tables, *plan, *wishes.compiled(world[1].dtype.name), len(wishes.slots), *choices[:2], self.turns,
+            *choices[2:],
+        )  # fmt: skip
+        return choices if done else None
+
+
 class Traffic:
     """The lanes of a state, whose links are in arrays of their own that decisions change."""
 
@@ -76,9 +116,14 @@ class Traffic:
         self.n = self.shape[-1]
         self.rows = state.speed.numel() // self.n
         self._take(state.lanes)
+        self._kind = state.speed.detach().numpy().dtype
         self._ring = float(self.road.ring or 0.0)
         self._lasting: _Lasting | None = None
         self._order: tuple[Array, Array] | None = None
+
+    @cached_property
+    def _deciding(self) -> Deciding:
+        return Deciding(self.simulator, self.rows, self.n, self._kind)
 
     @property
     def lanes(self) -> LaneState:
@@ -105,10 +150,8 @@ class Traffic:
             self._take(state.lanes)
         return state
 
-    def _present(self, state: State) -> tuple[Array, bool]:
-        if state.present is None:
-            return np.empty(0, state.speed.detach().numpy().dtype), False
-        return dense(state.present, self.shape), True
+    def _present(self, state: State) -> Array:
+        return np.empty(0, self._kind) if state.present is None else dense(state.present, self.shape)
 
     def places(self, state: State, halo: int) -> Places | None:
         """Return where vehicles lie in a row for as many steps as the halo is for; None where links are no order."""
@@ -134,47 +177,43 @@ class Traffic:
             order_loops.laid_by(*order, self.rows, self.n, count, around, wide, *to)
             return True
         lanes_of, leader, follower = (dense(x, self.shape) for x in self.lanes[:3])
-        position, presence = dense(state.position, self.shape), self._present(state)
-        arguments = leader, follower, lanes_of, position, *presence, np.arange(self.rows), self.n, count, self._ring
+        position, present = dense(state.position, self.shape), self._present(state)
+        world = leader, follower, lanes_of, position, present, len(present) > 0
+        arguments = *world, np.arange(self.rows), self.n, count, self._ring
         return bool(order_loops.laid(*arguments, around, wide, *to))
 
-    def decide(self, found: Decision | str, state: State, inputs: Inputs, params: Params, stage: int) -> State | None:
-        """Return the state after those have decided whose turn it is at a stage, or None where links are no order."""
-        if isinstance(found, str):
+    def decide(
+        self, wishes: Decision | str, state: State, inputs: Inputs, params: Params, turn: Sequence[Array]
+    ) -> State | None:
+        """Return the state after those have decided whose turn it is, or None where links are no order.
+
+        ``turn`` are the rows that decide, and their stages.
+        """
+        if isinstance(wishes, str):
             after = decided(self.simulator, state._replace(lanes=self.lanes), inputs, params)
             self._take(after.lanes)
             return after
-        kind = state.speed.detach().numpy().dtype
-        phase, constants = found.compiled(kind.name)
-        plan, places, held = self._plan(found, state, inputs, params)
-        fresh = np.zeros(self.rows * self.n, np.uint8)
-        sees = self.simulator.sees_mergers
-        turns = self.simulator.turns(self.n).numpy() if self.simulator.decides_in_blocks else np.empty(0, np.int64)
-        merger = np.tile(np.arange(self.n), self.rows if sees else 0)
-        order, begin = np.empty(self.rows * self.n, np.int64), np.empty(self.rows * (self.road.count + 1), np.int64)
-        tables = np.array([self.road.table(name) for name in ("opens", "closes", "stops")], kind)
-        done = lane_change_loops.decide(
-            self._links, dense(state.position, self.shape), *self._present(state), np.arange(self.rows),
-            np.full(self.rows, stage), self.n, self.road.count, self._ring, self.road.handed == "left", tables, plan,
-            places, phase, constants, len(found.slots), fresh, merger, turns, order, begin,
-        )  # fmt: skip
+        *plan, held = self._plan(wishes, state, inputs, params)
+        world = self._links, dense(state.position, self.shape), self._present(state)
+        choices = self._deciding.decide(wishes, world, turn, plan)
         del held
         self._changed = True
-        if not done:
+        if choices is None:
             return None
-        self._order = order, begin
-        which = torch.from_numpy(np.flatnonzero(fresh))
+        self._order = choices[2:] if len(turn[0]) == self.rows else None
+        which = torch.from_numpy(np.flatnonzero(choices.fresh))
         links = self.lanes
         if len(which):
             gap = Linked(self.road, links, state.position).gaps_of(which, state.position, state.length)
             full = state.gap.expand(self.shape).reshape(-1)
             state = state._replace(gap=full.index_put((which,), gap).view(self.shape))
         state = on_lanes(state._replace(lanes=links))
-        if not sees:
+        if not self.simulator.sees_mergers:
             return state
-        due = torch.ones((), dtype=torch.bool) if state.present is None else state.present > 0
+        due = torch.zeros(self.rows, dtype=torch.bool).index_fill(0, torch.from_numpy(turn[0]), True)
+        due = due.view(*self.shape[:-1], 1) & (True if state.present is None else state.present > 0)
         view = Linked(self.road, links, state.position)
-        return seen_merging(view, state, torch.from_numpy(merger).view(self.shape), due)
+        return seen_merging(view, state, torch.from_numpy(choices.merger).view(self.shape), due)
 
     def _plan(self, kernel: Decision, state: State, inputs: Inputs, params: Params) -> tuple[Array, Array, list[Array]]:
         """Return what rows are filled with, whose numbers these are, and the arrays that the plan points to.

@@ -36,6 +36,8 @@ _PARTS: Mapping[Any, Sequence[str]] = {
     classmethod: ("__func__",), property: ("fget",), functools.cached_property: ("func",),
 }  # fmt: skip
 """What is read of objects of Python's own types."""
+_FIXED = {tuple, frozenset, partial, MethodType}
+"""Types of which nobody can change what they hold."""
 
 Look = Callable[[], Sequence[Any]]
 """Returns some values as they are now."""
@@ -79,7 +81,8 @@ def _watches(roots: list[Any], names: set[str]) -> list[tuple[Look, Sequence[Any
             continue
         seen[id(x)] = x
         for look in _looks(x, names):
-            watches.append((look, then := look()))
+            then = look()
+            watches += [] if type(x) in _FIXED else [(look, then)]
             count += len(then)
             roots += then
         if count > _MOST:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import weakref
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -47,38 +47,31 @@ class _LaidOut:
     Nothing here is kept alive by that; states are known by their tensors of links and presence, which nobody changes.
     """
 
-    def __init__(self, most: int = 8) -> None:
-        self._kept: dict[int, tuple[tuple[weakref.ref[Tensor] | None, ...], tuple[int, ...], int, Places]] = {}
-        self._most = most
+    def __init__(self) -> None:
+        self._kept: dict[int, tuple[list[weakref.ref[Tensor] | None], list[int], int, Places]] = {}
 
     @staticmethod
-    def _parts(state: State) -> tuple[Tensor | None, ...]:
+    def _parts(state: State) -> tuple[list[Tensor | None], list[int]]:
+        """Return links and presence, and their versions."""
         assert state.lanes is not None
-        return *state.lanes[:3], state.present
+        parts = [*state.lanes[:3], state.present]
+        return parts, [-1 if x is None or x.is_inference() else x._version for x in parts]
 
     def of(self, state: State, halo: int) -> Places | None:
         """Return the places of a state, or None where they are not known."""
-        parts = self._parts(state)
-        entry = self._kept.get(id(parts[1]))
-        if entry is None or entry[2] != halo:
-            return None
-        # What was kept is no inference tensor, so it has a version.
-        same = all((ref and ref()) is x for ref, x in zip(entry[0], parts, strict=True))
-        return entry[3] if same and entry[1] == _versions(parts) else None
+        parts, versions = self._parts(state)
+        refs, then, around, places = self._kept.get(id(parts[1]), ([], [], 0, None))
+        same = (around, then) == (halo, versions) and all((r and r()) is x for r, x in zip(refs, parts, strict=True))
+        return places if same else None
 
     def put(self, state: State, halo: int, places: Places) -> None:
         """Keep the places of a state; not in ``torch.inference_mode``, whose tensors do not tell when they change."""
-        parts = self._parts(state)
+        parts, versions = self._parts(state)
         if any(x is not None and x.is_inference() for x in parts):
             return
-        refs = tuple(None if x is None else weakref.ref(x) for x in parts)
-        while len(self._kept) >= self._most:
+        while len(self._kept) >= 8:
             self._kept.pop(next(iter(self._kept)))
-        self._kept[id(parts[1])] = refs, _versions(parts), halo, places
-
-
-def _versions(parts: tuple[Tensor | None, ...]) -> tuple[int, ...]:
-    return tuple(-1 if x is None else x._version for x in parts)
+        self._kept[id(parts[1])] = [None if x is None else weakref.ref(x) for x in parts], versions, halo, places
 
 
 _LAID_OUT = _LaidOut()
@@ -111,33 +104,24 @@ def rollout(
     traffic = Traffic(simulator, state)
     motions: list[tuple[Tensor, ...]] = []
     first, halo, places = state, 0, None
-    done, clocks = 0, state.step.reshape(-1).numpy()
-    if (clocks == clocks[0]).all():
-        clocks = clocks[:1]
+    done, clocks = 0, state.step.expand(state.speed.shape[:-1]).reshape(-1).numpy()
     while done < steps:
         phase = (clocks + done) % every
         own_turn = np.isin(phase, stages) if blocks else (phase == 0) & stops
-        wishes: Any = ""
-        if simulator.lane_change_models and own_turn.any():
-            wishes = decision(simulator, Form.of(state._replace(lanes=None), inputs))
-        alike = len(phase) == 1
-        if own_turn.all() and alike:
-            if (after := _decided(traffic, wishes, state, _cut(inputs, done, None), params, int(phase[0]))) is None:
-                return None
-            state = after
+        if own_turn.any():
+            # Rows of a vector whose episodes began at different times decide at different steps.
+            rows, state = np.flatnonzero(own_turn), traffic.begin(state, params)
+            if simulator.lane_change_models:
+                wishes = decision(simulator, Form.of(state._replace(lanes=None), inputs))
+                after = traffic.decide(wishes, state, _cut(inputs, done, None), params, (rows, phase[rows]))
+                if after is None:
+                    return None
+                state = after
         until = min(int(((stage - phase - 1) % every + 1).min()) for stage in stages) if stops else steps - done
         count = min(until, block, steps - done)
         halo = tiles.halo(count, kernel.program.reach)
         # Within a rollout decisions change links in place, so only what comes in is looked up.
         places = _LAID_OUT.of(state, halo) if state.lanes is first.lanes else None
-        for stage in () if alike else np.unique(phase[own_turn]).tolist():
-            which = torch.from_numpy(np.flatnonzero(phase == stage))
-            now = _cut(inputs, done, None)
-            mixed = _some_decided(simulator, wishes, state, now, params, which, stage, halo, places)
-            if mixed is None:
-                return None
-            state, places = mixed
-            traffic = Traffic(simulator, state)
         places = traffic.places(state, halo) if places is None else places
         if places is None:
             return None
@@ -155,49 +139,6 @@ def rollout(
     if places is not None:
         _LAID_OUT.put(state, halo, places)
     return state, tuple(torch.cat(column) for column in zip(*motions, strict=True)) if keep else None
-
-
-def _decided(traffic: Traffic, wishes: Any, state: State, inputs: Inputs, params: Params, stage: int) -> State | None:
-    """Return the state after all rows have decided, ``stage`` steps into a period; None where links are no order."""
-    simulator = traffic.simulator
-    state = traffic.begin(state, params) if stage == 0 else state
-    return traffic.decide(wishes, state, inputs, params, stage) if simulator.lane_change_models else state
-
-
-def _some_decided(
-    simulator: Simulator, wishes: Any, state: State, inputs: Inputs, params: Params, which: Tensor, stage: int,
-    halo: int, places: Places | None,
-) -> tuple[State, Places | None] | None:  # fmt: skip
-    """Return the state after some rows (indices) have decided, and where vehicles lie then, if that was known before.
-
-    Rows of a vector whose episodes began at different times decide at different steps. None where links are no order.
-    """
-    rows = len(state.speed)
-    part = _of_rows(state, which, rows)._replace(step=state.step[which])
-    own, own_inputs = (_of_rows(dict(x), which, rows) for x in (params, inputs))
-    traffic = Traffic(simulator, part)
-    after = _decided(traffic, wishes, part, own_inputs, own, stage)
-    if after is None:
-        return None
-    after = after._replace(lanes=traffic.lanes, step=state.step)
-    if places is not None:
-        fresh = traffic.places(after._replace(step=part.step), halo)
-        places = None if fresh is None else _put(places, places, fresh, which, rows)
-    return _put(state, part._replace(step=state.step), after, which, rows), places
-
-
-def _of_rows(tree: Tree, which: Tensor, rows: int) -> Tree:
-    """Return what belongs to some rows; what is the same for all of them stays."""
-    return mapped(lambda x: x[which] if x.dim() > 1 and len(x) == rows else x, tree)
-
-
-def _put(tree: Tree, before: Tree, after: Tree, which: Tensor, rows: int) -> Tree:
-    """Return a tree in which some rows, that were ``before``, are ``after``; what is the same tensor stays."""
-
-    def put(x: Tensor, was: Tensor, now: Tensor) -> Tensor:
-        return x if now is was else x.expand(rows, *now.shape[1:]).index_put((which,), now)
-
-    return mapped(put, tree, before, after)
 
 
 def _cut(tree: Tree, begin: int, count: int | None) -> Tree:
