@@ -13,7 +13,7 @@ pytest.importorskip("numba")
 from idm_env import IDM, Lanes, Simulator
 from idm_env.compiled.kernels.rows import RowFunction, adjoint
 from idm_env.effects import Mobil, make
-from idm_env.envs.worlds import examples_of, named, world_of
+from idm_env.envs.worlds import named, world_of
 from idm_env.multilane.demand import trips, waiting
 from idm_env.roads.layout import lane_drop
 from idm_env.tasks import EnvState
@@ -68,6 +68,13 @@ def test_searches_rolls_and_reductions_by_index():
         assert np.array_equal(out[name], x.numpy()), name
 
 
+def test_infinity_is_looked_for_in_numbers_of_their_own_kind():
+    """It was looked for in truth values, among which there is none."""
+    numbers = torch.tensor([[0.0, torch.inf, 1.0, -torch.inf, 2.0]]).expand(MANY, -1).contiguous()
+    out = called(RowFunction(lambda x: {"y": x.isinf()}, {"x": numbers}, MANY), {"x": numbers.numpy()})
+    assert out["y"].tolist() == [[False, True, False, True, False]] * ROWS
+
+
 def test_a_whole_step_on_several_lanes_is_one_function_of_rows():
     """Vehicles enter, change lanes and leave; a recording asks nobody whether they do."""
     road = Lanes(2, length=150.0, ends=(lane_drop(0, at=110.0),))
@@ -88,7 +95,8 @@ def test_a_whole_step_on_several_lanes_is_one_function_of_rows():
         after = EnvState(simulator.step(world_of(leaves, world).state, {}, params), {})
         return {f"then_{n}": x for n, x in named(after).items()}
 
-    loops = RowFunction(step, examples_of(world, MANY), MANY)
+    many = {n: x[:1].expand(MANY, *x.shape[1:]).contiguous() for n, x in named(world).items()}
+    loops = RowFunction(step, many, MANY)
     leaves = {n: x.contiguous() for n, x in named(world).items()}
     for _ in range(40):
         out, after = called(loops, {n: x.numpy() for n, x in leaves.items()}), step(**leaves)

@@ -380,7 +380,8 @@ class RowFunction:
             name, args = "where", (args[1], args[2], args[0])
         if name in self.unary or name in ("_to_copy", "clone"):
             form = self.unary.get(name, "{0}")
-            return self._each(to, shape, lambda cell: form.format(self._at(args[0], cell, to.kind)))
+            kind = None if name == "isinf" else to.kind
+            return self._each(to, shape, lambda cell: form.format(self._at(args[0], cell, kind)))
         if name in BINARY or name in COMPARE:
             kind = to.kind if name in BINARY else self._common(args)
             form = BINARY.get(name) or COMPARE[name]
