@@ -15,17 +15,8 @@ from idm_env.data.hidden import Drivers, View
 
 
 @dataclass(frozen=True)
-class Scripted:
-    """Vehicles that are not simulated, on the fine clock: arrays [steps, runs] or [steps, runs, vehicles]."""
-
-    position: np.ndarray
-    speed: np.ndarray
-    accel: np.ndarray
-
-
-@dataclass(frozen=True)
-class Motions:
-    """Simulated followers on the fine clock, arrays [steps, runs, followers]."""
+class PlatoonMotion:
+    """Vehicles on the fine clock, scripted or simulated: arrays [steps, runs] or [steps, runs, vehicles]."""
 
     position: np.ndarray
     speed: np.ndarray
@@ -47,8 +38,8 @@ class Platoon:
         noise: Random acceleration of the drivers [steps, runs, followers] in m/s².
     """
 
-    leader: Scripted
-    beside: Scripted | None
+    leader: PlatoonMotion
+    beside: PlatoonMotion | None
     drivers: Drivers
     lengths: np.ndarray
     starts: np.ndarray
@@ -56,11 +47,11 @@ class Platoon:
     on: dict[str, float]
     noise: np.ndarray
 
-    def run(self) -> Motions:
+    def run(self) -> PlatoonMotion:
         """Return the followers' motions, started in equilibrium at their leader's first speed."""
         steps = len(self.leader.position)
         shape = self.drivers.time_gap.shape
-        out = Motions(*(np.empty((steps, *shape)) for _ in range(3)))
+        out = PlatoonMotion(*(np.empty((steps, *shape)) for _ in range(3)))
         self._seen = np.empty((3, steps, *shape))
         self._held = np.zeros(shape)
         state = self._start()

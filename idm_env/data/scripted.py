@@ -6,12 +6,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
-from idm_env.data.platoon import Scripted
+from idm_env.data.platoon import PlatoonMotion
 
 VEHICLES_BESIDE = 30
 
 
-def leaders(random: np.random.Generator, runs: int, steps: int, step: float, cruise: float) -> Scripted:
+def leaders(random: np.random.Generator, runs: int, steps: int, step: float, cruise: float) -> PlatoonMotion:
     """Return leaders that stop and go, cruise, brake sharply and run away for a while, as a smooth speed profile."""
     speed, draw = np.empty((steps, runs)), random.uniform
     for run in range(runs):
@@ -34,14 +34,14 @@ def leaders(random: np.random.Generator, runs: int, steps: int, step: float, cru
     speed = np.maximum(gaussian_filter1d(speed, 0.6 / step, axis=0, mode="nearest"), 0.0)
     moved = np.cumsum((speed[1:] + speed[:-1]) * (step / 2), axis=0)
     position = random.uniform(0.0, 200.0, runs) + np.concatenate([np.zeros((1, runs)), moved])
-    return Scripted(position, speed, np.gradient(speed, step, axis=0))
+    return PlatoonMotion(position, speed, np.gradient(speed, step, axis=0))
 
 
 LAP_M = 900.0
 BENDS_M = (150.0, 380.0, 640.0)
 
 
-def lapping(random: np.random.Generator, runs: int, steps: int, step: float, cruise: float) -> Scripted:
+def lapping(random: np.random.Generator, runs: int, steps: int, step: float, cruise: float) -> PlatoonMotion:
     """Return leaders that drive laps of `LAP_M` and brake for the same bends every time, each a little differently."""
     position, speed = np.empty((2, steps, runs))
     x, v = random.uniform(0.0, LAP_M, runs), np.full(runs, 0.6 * cruise)
@@ -58,16 +58,16 @@ def lapping(random: np.random.Generator, runs: int, steps: int, step: float, cru
     speed = gaussian_filter1d(speed, 0.4 / step, axis=0, mode="nearest")
     moved = np.cumsum((speed[1:] + speed[:-1]) * (step / 2), axis=0)
     position = position[0] + np.concatenate([np.zeros((1, runs)), moved])
-    return Scripted(position, speed, np.gradient(speed, step, axis=0))
+    return PlatoonMotion(position, speed, np.gradient(speed, step, axis=0))
 
 
-def adjacent_queue(leader: Scripted) -> Scripted:
+def adjacent_queue(leader: PlatoonMotion) -> PlatoonMotion:
     """Return a slower queue in the adjacent lane, long enough to have somebody beside each follower all the time."""
     start = leader.position[0][None, :, None]
     ahead = 40.0 * (np.arange(VEHICLES_BESIDE) - 6)
     position = start + ahead + 0.7 * (leader.position[:, :, None] - start)
     ones = np.ones(VEHICLES_BESIDE)
-    return Scripted(position, 0.7 * leader.speed[:, :, None] * ones, 0.7 * leader.accel[:, :, None] * ones)
+    return PlatoonMotion(position, 0.7 * leader.speed[:, :, None] * ones, 0.7 * leader.accel[:, :, None] * ones)
 
 
 def ornstein_uhlenbeck(

@@ -11,7 +11,7 @@ import polars as pl
 from idm_env.data import hidden, scripted
 from idm_env.data.errors import DataError, nearest
 from idm_env.data.hidden import EFFECTS, Drivers
-from idm_env.data.platoon import Motions, Platoon
+from idm_env.data.platoon import Platoon, PlatoonMotion
 from idm_env.data.trajectories import Trajectories
 
 __all__ = ["EFFECTS", "Truth", "generate"]
@@ -143,7 +143,7 @@ def _drivers(random: np.random.Generator, shape: tuple[int, int], spread: float)
     return Drivers(**{field.name: draw(field.name) for field in fields(Drivers)})
 
 
-def _motion_table(platoon: Platoon, motion: Motions, dt: float) -> pl.DataFrame:
+def _motion_table(platoon: Platoon, motion: PlatoonMotion, dt: float) -> pl.DataFrame:
     every = slice(None, None, SUBSTEPS)
     groups = [(platoon.leader, 1), (motion, 1)] + ([(platoon.beside, 2)] if platoon.beside else [])
     parts, first = [], 1

@@ -12,7 +12,7 @@ It begins at its mean, 0, unless ``Simulator.state`` is given a seed, and what a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -41,24 +41,33 @@ def _memory_time(default: float) -> Parameter:
     return Parameter("memory_time", "τ", "s", default, 0.1, 600.0, role="shape")
 
 
-def _begun(scene: Scene) -> Tensor:
-    return torch.zeros_like(scene.speed)
-
-
-def _level(effect: Effect, scene: Scene, p: P) -> Tensor:
+def _level(effect: Any, scene: Scene, p: P) -> Tensor:
     """Return n of this step, from that of the step before and ξ."""
     decay = torch.exp(-scene.dt / p["memory_time"])
     level: Tensor = decay * scene.memory[effect.name] + torch.sqrt(1.0 - decay * decay) * scene.input(effect.name)
     return level
 
 
+class _Drifting:
+    """Part of an effect that has n for its memory ``(…, vehicles)``."""
+
+    draws = True
+
+    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return n = 0."""
+        return torch.zeros_like(scene.speed)
+
+    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return n."""
+        return _level(self, scene, p)
+
+
 @dataclass(frozen=True)
-class AccelNoise(Effect):
+class AccelNoise(_Drifting, Effect):  # type: ignore[misc]
     """Drifting acceleration ``+ σ n``: what a driver does beside what the scene asks for, for about τ."""
 
     kind = "accel_noise"
     sees_truth = True
-    draws = True
     title = "drifting acceleration"
     equation = "+ σ n, dn = −n dt/τ + √(2/τ) dW"
     wording = ("", "drivers accelerate by something beside the scene that wanders in time")
@@ -67,21 +76,13 @@ class AccelNoise(Effect):
     acts_on = "acceleration"
     declared = (Parameter("sigma", "σ", "m/s²", 0.1, 0.0, 2.0, null=0.0), _memory_time(2.0))
 
-    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return n = 0."""
-        return _begun(scene)
-
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return σ n (m/s²)."""
         return p["sigma"] * _level(self, scene, p)
 
-    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return n."""
-        return _level(self, scene, p)
-
 
 @dataclass(frozen=True)
-class Wander(Effect):
+class Wander(_Drifting, Effect):  # type: ignore[misc]
     """A parameter of the driver that wanders about his own: ``T e^(σ n)``, or v0 or s0 likewise (``of``).
 
     The process is that of errors of perception (Treiber, Kesting, Helbing 2006, Physica A 360), here on a parameter.
@@ -89,7 +90,6 @@ class Wander(Effect):
 
     kind = "wander"
     sources = (PUBLICATIONS["treiber_2006"],)
-    draws = True
     rank = 5
     title = "wandering style"
     equation = "T e^(σ n), dn = −n dt/τ + √(2/τ) dW"
@@ -105,22 +105,14 @@ class Wander(Effect):
         """``wander`` for the time gap, else ``wander_`` and the parameter."""
         return self.kind if self.of == "time_gap" else f"{self.kind}_{self.of}"
 
-    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return n = 0."""
-        return _begun(scene)
-
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the parameter in force."""
         factor = torch.exp(p["sigma"] * _level(self, scene, p))
         return driver._replace(**{self.of: getattr(driver, self.of) * factor})
 
-    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return n."""
-        return _level(self, scene, p)
-
 
 @dataclass(frozen=True)
-class PerceptionNoise(Effect):
+class PerceptionNoise(_Drifting, Effect):  # type: ignore[misc]
     """Errors of what the driver sees of the leader: the gap as ``s e^(σ n)``, or the closing speed as ``Δv + σ s n``.
 
     The human-driver model has both, with σ = 0.05 and 0.01/s and τ = 20 s (Treiber, Kesting, Helbing 2006, Physica A
@@ -129,7 +121,6 @@ class PerceptionNoise(Effect):
 
     kind = "perception_noise"
     sources = (PUBLICATIONS["treiber_2006"],)
-    draws = True
     title = "drifting errors of perception"
     equation = "s e^(σ n) or Δv + σ s n, dn = −n dt/τ + √(2/τ) dW"
     wording = ("", "drivers misjudge the gap or the closing speed, for a while each time")
@@ -153,10 +144,6 @@ class PerceptionNoise(Effect):
         )
         return (sigma, _memory_time(20.0))
 
-    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return n = 0."""
-        return _begun(scene)
-
     def perceive(self, scene: Scene, p: P) -> Scene:
         """Return the scene with the misjudged leader."""
         leader = scene.leader
@@ -164,10 +151,6 @@ class PerceptionNoise(Effect):
         if self.signal == "gap":
             return scene._replace(leader=leader._replace(gap=leader.gap * torch.exp(error)))
         return scene._replace(leader=leader._replace(speed=leader.speed - error * leader.gap))
-
-    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return n."""
-        return _level(self, scene, p)
 
 
 DRIFTS: tuple[Effect, ...] = (Wander(), Wander(of="desired_speed"), AccelNoise(), PerceptionNoise())

@@ -65,9 +65,9 @@ class Choice(abc.ABC):
         """Return where a fit begins."""
         return [[p.default for p in self.parameters]]
 
+    @abc.abstractmethod
     def prior(self, theta: Tensor) -> Tensor:
         """Return the logarithm of the prior, but for a constant."""
-        return torch.zeros((), dtype=theta.dtype)
 
     def log_probabilities(self, theta: Tensor, decisions: Decisions) -> Tensor:
         """Return the logarithms of the probabilities to stay, and to change to the left and right, [N, 3]."""
@@ -138,40 +138,26 @@ def _coefficient(name: str, default: float = 0.0) -> Parameter:
 
 
 @dataclass(frozen=True)
-class ConstantRate(Choice):
-    """Everybody changes with one probability to the left, and one to the right, wherever there is room."""
-
-    title: str = "constant rate"
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Logarithms of the odds."""
-        return _coefficient("left", -4.0), _coefficient("right", -4.0)
-
-    def values(self, theta: Tensor, decisions: Decisions) -> Tensor:
-        """Return the two numbers."""
-        return theta.expand(len(decisions), 2)
-
-
-@dataclass(frozen=True)
-class GapLogit(Choice):
-    """A logit of gaps and relative speeds on the lane beside, without a car-following law (as Ahmed 1999, MIT).
+class LinearLogit(Choice):
+    """A logit without a car-following law: a constant rate to each side, or the acceptance of gaps (Ahmed 1999, MIT).
 
     ``ln P(side)/P(stay) = c_side + Σ β_k x_k``, x: logarithms of the gaps to the leader and the follower there (at most
     200 m), how much faster than the driver the leader there is, and how much slower the follower (10 m/s; 0
-    where nobody is). Coefficients have a normal prior of deviation 3.
+    where nobody is). Coefficients have a normal prior of deviation 3; a constant rate has none.
     """
 
-    title: str = "gap acceptance"
+    title: str
+    coefficients: tuple[str, ...] = ()
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Two constants and four coefficients."""
-        sides = _coefficient("left", -4.0), _coefficient("right", -4.0)
-        return (*sides, *(_coefficient(n) for n in ("lead_gap", "lag_gap", "lead_speed", "lag_speed")))
+        """Two constants, logarithms of odds, and the coefficients."""
+        return (*(_coefficient(n, -4.0) for n in ("left", "right")), *(_coefficient(n) for n in self.coefficients))
 
     def values(self, theta: Tensor, decisions: Decisions) -> Tensor:
         """Return the linear form."""
+        if not self.coefficients:
+            return theta.expand(len(decisions), 2)
         scene, sides = decisions.scene, []
         for i, side in enumerate((scene.left, scene.right)):
             assert side is not None
@@ -184,6 +170,10 @@ class GapLogit(Choice):
     def prior(self, theta: Tensor) -> Tensor:
         """Return that of the coefficients."""
         return -0.5 * (theta[2:] / _PRIOR).square().sum()
+
+
+CONSTANT_RATE = LinearLogit("constant rate")
+GAP_ACCEPTANCE = LinearLogit("gap acceptance", ("lead_gap", "lag_gap", "lead_speed", "lag_speed"))
 
 
 class Chosen(NamedTuple):

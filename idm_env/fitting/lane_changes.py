@@ -109,7 +109,7 @@ def lane_changes(
     )  # fmt: skip
     free = options.free or tuple(f"{Mobil.kind}.{p.name}" for p in Mobil.declared)
     mobil = discrete_choice.UtilityLogit(model.simulator(Lanes(2)), free)
-    models: list[discrete_choice.Choice] = [mobil, discrete_choice.ConstantRate(), discrete_choice.GapLogit()]
+    models: list[discrete_choice.Choice] = [mobil, discrete_choice.CONSTANT_RATE, discrete_choice.GAP_ACCEPTANCE]
     fitted = []
     for k, each in enumerate(models):
         progress("fitting", k, len(models), each.title)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,10 +52,8 @@ class Decisions:
 
     def select(self, mask: Tensor) -> Decisions:
         """Return the decisions at a mask [N]."""
-        return Decisions(
-            _picked(self.scene, mask), _picked(dict(self.params), mask), self.possible[mask], self.chosen[mask],
-            self.vehicle[mask], self.vehicles, self.every, self.left_out,
-        )  # fmt: skip
+        each = {name: _picked(getattr(self, name), mask) for name in ("scene", "params", "chosen", "vehicle")}
+        return replace(self, possible=self.possible[mask], **each)
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,6 @@ class _Run:
     the decision begins, and a decision later.
     """
 
-    name: str
     position: np.ndarray
     speed: np.ndarray
     accel: np.ndarray
@@ -110,7 +107,7 @@ def recorded_decisions(
         rows = table.filter((pl.col("run_id") == run) & pl.col("lane").is_not_null())
         if rows.height == 0:
             continue
-        clocked, ids = _on_clock(rows, run, trajectories.steps[run], every, ahead, first_lane)
+        clocked, ids = _on_clock(rows, trajectories.steps[run], every, ahead, first_lane)
         mine = np.array([drivers_taken is None or f"{run}/{v}" in drivers_taken for v in ids])
         drivers = [params_of(f"{run}/{v}") for v in ids]
         for begin in range(0, len(clocked.position), max(1, ROWS // len(ids))):
@@ -131,9 +128,7 @@ _WORDS = {
 }
 
 
-def _on_clock(
-    rows: pl.DataFrame, run: str, dt: float, every: float, ahead: float, first_lane: str
-) -> tuple[_Run, list[str]]:
+def _on_clock(rows: pl.DataFrame, dt: float, every: float, ahead: float, first_lane: str) -> tuple[_Run, list[str]]:
     """Return the vehicles of a run on the clock of decisions."""
     stride, early = max(1, round(every / dt)), round(ahead / dt)
     time = rows["time_s"].to_numpy()
@@ -160,7 +155,7 @@ def _on_clock(
     begin = np.arange(0, max(last + 1, 0), stride)
     rings = rows["ring_length_m"].drop_nulls() if "ring_length_m" in rows.columns else rows["lane"].head(0)
     return _Run(
-        run, position[begin], np.clip(speed[begin], 0.0, None), np.nan_to_num(accel[begin]), length[begin],
+        position[begin], np.clip(speed[begin], 0.0, None), np.nan_to_num(accel[begin]), length[begin],
         lane[begin], lane[begin + early], lane[begin + early + stride], len(numbers),
         float(rings[0]) if len(rings) else None,
     ), ids  # fmt: skip

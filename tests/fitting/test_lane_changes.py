@@ -11,7 +11,7 @@ import torch
 
 from idm_env.data import DataError, Trajectories
 from idm_env.effects import IDM, Brakes, Mobil
-from idm_env.fitting.discrete_choice import ConstantRate, GapLogit, UtilityLogit, fit_choice
+from idm_env.fitting.discrete_choice import CONSTANT_RATE, GAP_ACCEPTANCE, UtilityLogit, fit_choice
 from idm_env.fitting.lane_changes import ChangeOptions, fit_lane_changes, lane_changes
 from idm_env.fitting.lane_decisions import LEFT, RIGHT, Decisions, recorded_decisions
 from idm_env.fitting.options import Source
@@ -98,7 +98,7 @@ def test_drawn_decisions_give_their_parameters_back(decisions: Decisions) -> Non
         row = rows[name]
         assert abs(row["estimate"] - truth) < 3.0 * row["standard_error"], (name, row)
         assert row["identified"] and row["standard_error"] < 0.3 * max(1.0, truth), (name, row)
-    for other in (ConstantRate(), GapLogit()):
+    for other in (CONSTANT_RATE, GAP_ACCEPTANCE):
         assert fit_choice(other, decisions).log_likelihood < found.log_likelihood - 100.0
 
 
