@@ -223,7 +223,7 @@ class Batch:
         if self.counters is not None:
             self.counters.begin(index, self.glance().state)
         if self.recording is not None:
-            self.recording.begin(index, self.episodes, self.glance().state)
+            self.recording.begin(index, self.glance().state)
         return seen
 
     def _took(self, index: np.ndarray, fresh: EnvState, draw: Draw, every: bool) -> Tensor | np.ndarray:
@@ -407,7 +407,7 @@ class Batch:
         if self.counters is not None and self.counters.loops:
             self.counters.after(self.glance().state)
         if self.recording is not None:
-            self.recording.after(outcome.whole, self.episodes, self.glance().state)
+            self.recording.after(outcome.whole, self.glance().state)
         reasons = self.task.held > 1 and self.count > 1 and "crash" in outcome.details
         if reasons and self.settings.device.type == "cpu":  # elsewhere it is told from the worlds where the action ends
             for row in np.flatnonzero(np.asarray(outcome.terminated.any(-1))).tolist():

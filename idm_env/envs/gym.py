@@ -94,7 +94,7 @@ class Pictures:
         batch = self.batch
         batch.recording = Recorder(self.task, batch.count)
         if batch.begun:
-            batch.recording.begin(np.arange(batch.count), batch.episodes, batch.glance().state)
+            batch.recording.begin(np.arange(batch.count), batch.glance().state)
         return batch.recording
 
     def close_extras(self, **kwargs: Any) -> None:

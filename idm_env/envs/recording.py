@@ -30,27 +30,30 @@ class Recorder:
 
     Columns are those of ``idm_env.data.schema``: times (s), front bumpers, speeds and accelerations as simulated, in
     double precision, so that they are read back to the bit; gaps (m) to the leader, lanes counted from 0 on the right,
-    and ``ring_length_m`` on a ring. ``run_id`` is ``"environment-episode"``, both from 0. A vehicle is its slot, with
+    and ``ring_length_m`` on a ring. ``run_id`` is ``"environment-episode"``, both from 0, seeded
+    anew or not. A vehicle is its slot, with
     ``"_trip_k"`` where vehicles enter and leave; of a recorded one ``vehicle_id`` is the record's.
     """
 
     def __init__(self, task: Task, count: int) -> None:
         self._task, self._over, self._moments = task, np.ones(count, bool), list[dict[str, np.ndarray]]()
+        self._runs = np.full(count, -1)
 
-    def begin(self, rows: np.ndarray, episodes: np.ndarray, state: State) -> None:
-        """Take the first rows of episodes that begin in some environments (indices); ``episodes`` of all."""
+    def begin(self, rows: np.ndarray, state: State) -> None:
+        """Take the first rows of episodes that begin in some environments (indices), whatever their seeds."""
         self._over[rows] = False
-        self._take(rows, episodes, state)
+        self._runs[rows] += 1
+        self._take(rows, state)
 
-    def after(self, whole: Any, episodes: np.ndarray, state: State) -> None:
+    def after(self, whole: Any, state: State) -> None:
         """Take the rows of a step of environments that go on; ``whole`` (``idm_env.envs.batch``) tells whose end it is.
 
         What drives on between its end and its reset is no part of an episode.
         """
-        self._take(np.flatnonzero(~self._over), episodes, state)
+        self._take(np.flatnonzero(~self._over), state)
         self._over |= np.asarray(torch.as_tensor(whole.terminated | whole.truncated).cpu())
 
-    def _take(self, rows: np.ndarray, episodes: np.ndarray, state: State) -> None:
+    def _take(self, rows: np.ndarray, state: State) -> None:
         """Keep the vehicles on the road in some environments (indices)."""
         road, speed, lanes = self._task.road.view(state), state.speed, state.lanes
         slot, around = torch.arange(speed.shape[-1], device=speed.device).expand_as(speed), road.lap(state)
@@ -58,7 +61,7 @@ class Recorder:
         led = (road.leader_present(state.present, speed) > 0) & (road.ahead(slot) != slot)
         columns = {column: getattr(state, name) for name, column in _STATE.items()}
         columns |= {"vehicle": trip, "leader": torch.where(led, road.ahead(trip), -1), "step": state.step.unsqueeze(-1)}
-        columns["run"] = torch.from_numpy(episodes * len(speed) + np.arange(len(speed))).unsqueeze(-1)
+        columns["run"] = torch.from_numpy(self._runs * len(speed) + np.arange(len(speed))).unsqueeze(-1)
         columns["lane"] = torch.tensor(self._task.lanes) if lanes is None else lanes.lane
         if around is not None:
             columns["ring_length_m"] = around.unsqueeze(-1)

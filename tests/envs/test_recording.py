@@ -70,6 +70,18 @@ def test_episodes_are_runs_and_what_drives_on_after_an_end_is_no_part_of_them():
     assert set(touched["time_s"]) == {1} and gaps["time_s"].to_list()[-2:] == [1, 41]
 
 
+def test_episodes_of_seeds_are_runs_of_their_own(tmp_path):
+    """A new seed begins its first episode anew: the file has as many runs as there were resets, and is read."""
+    env = gym.make("DiffIDM-v0", task="follow", vehicles=3)
+    recording = env.unwrapped.record()
+    for seed in (0, 1, 0):
+        env.reset(seed=seed)
+        for _ in range(10):
+            env.step(None)
+    recording.write(tmp_path / "run.csv")
+    assert load(tmp_path / "run.csv").table["run_id"].unique().sort().to_list() == ["0-0", "0-1", "0-2"]
+
+
 def test_what_cannot_be_recorded_is_told_in_one_line(tmp_path):
     env = gym.make("DiffIDM-v0", warmup=5, output="torch")
     recording = env.unwrapped.record()
