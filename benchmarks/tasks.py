@@ -7,7 +7,7 @@ keywords of ``GIVEN``:
 * *random*, *zero*, and the *constant* that is best of 13 accelerations on other episodes;
 * *rule*: IDM's formula as commands, its six numbers the best of a cross-entropy search that sees only returns;
 * *PPO*: Stable-Baselines3's, ten lines as in README, its steps chosen by task, several seeds, each its last policy;
-* *APG*, on one lane: gradients through 50 decisions of 32 environments, 100 times, each seed's last policy;
+* *APG*, on one lane: gradients through 60 decisions of 32 environments, 200 times, each seed's last policy;
 * *oracle*: that rule with the six numbers that are best in each of these episodes, found on it: what foresight
   is worth.
 
@@ -49,9 +49,16 @@ TRAINING: dict[str, dict[str, Any]] = {"ring": {"warmup_pool": 256}}
 """Keywords of training alone: episodes begin in one of so many worlds."""
 OPEN = ("open_highway", "merge", "bottleneck", "approach")
 """Roads that vehicles enter and leave, whose episodes take longest: searches are a quarter as large there."""
-STEPS = {"ring": 250_000, "follow": 200_000, "platoon": 150_000, "highway": 300_000, **dict.fromkeys(OPEN, 50_000)}
+STEPS = {
+    "ring": 250_000,
+    "follow": 200_000,
+    "platoon": 150_000,
+    "highway": 300_000,
+    "replay": 200_000,
+    **dict.fromkeys(OPEN, 50_000),
+}
 """Steps of PPO; of others 100 000."""
-WINDOWS = (50, 1e-2, 100)
+WINDOWS = (60, 1e-2, 200)
 """Of APG: decisions in a window, Adam's first step, which falls to 0, and windows."""
 GRADIENTS = ("follow", "platoon", "replay")
 """Tasks that have a row of APG."""
@@ -64,6 +71,12 @@ IDLE, LEARNT = ("random", "zero", "constant"), ("PPO", "APG")
 """Rows of what learns nothing, and those that have seeds."""
 
 Act = Callable[[np.ndarray], np.ndarray]
+Watch = Callable[[Act], None]
+"""Is shown a policy in training, now and then."""
+
+
+def unwatched(act: Act) -> None:
+    """Watch nothing."""
 
 
 def returns(task: str, act: Act | None, seeds: Sequence[int], **more: Any) -> tuple[np.ndarray, int]:
@@ -152,8 +165,8 @@ def oracle(task: str, known: np.ndarray) -> np.ndarray:
     return np.exp(best)
 
 
-def apg(task: str, seed: int) -> Act:
-    """Return the last policy of ascending gradients through windows of traffic; README's second figure."""
+def apg(task: str, seed: int, watch: Watch = unwatched) -> Act:
+    """Return the last policy of ascending gradients through windows of traffic."""
     torch.manual_seed(seed)
     keywords = {**GIVEN.get(task, {}), **TRAINING.get(task, {})}
     env = gymnasium.make_vec("DiffIDM-v0", num_envs=32, task=task, output="torch", **keywords)
@@ -162,6 +175,10 @@ def apg(task: str, seed: int) -> Act:
     policy = torch.nn.Sequential(*(part for layer in layers for part in (layer, torch.nn.Tanh())))
     layers[-1].weight.data *= 0.01
     ascent = torch.optim.Adam(policy.parameters(), WINDOWS[1], maximize=True)
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        return np.asarray(policy(torch.as_tensor(seen)).detach())
+
     for update in range(WINDOWS[2]):
         ascent.param_groups[0]["lr"] = WINDOWS[1] * (1.0 - update / WINDOWS[2])
         env.unwrapped.detach()  # type: ignore[attr-defined]
@@ -169,10 +186,12 @@ def apg(task: str, seed: int) -> Act:
         env.unwrapped.unroll(policy, steps=WINDOWS[0]).reward.mean().backward()  # type: ignore[attr-defined]
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         ascent.step()
-    return lambda seen: policy(torch.as_tensor(seen)).detach().numpy()
+        if update % 10 == 9:
+            watch(act)
+    return act
 
 
-def ppo(task: str, seed: int) -> Act:
+def ppo(task: str, seed: int, watch: Watch = unwatched) -> Act:
     """Return the last policy of Stable-Baselines3's PPO, by the lines of README."""
     from stable_baselines3 import PPO
 
@@ -181,8 +200,31 @@ def ppo(task: str, seed: int) -> Act:
     keywords = {**GIVEN.get(task, {}), **TRAINING.get(task, {})}
     env = SB3VecEnv(gymnasium.make_vec("DiffIDM-v0", num_envs=32, task=task, **keywords))
     model = PPO("MlpPolicy", env, n_steps=128, batch_size=512, learning_rate=lambda left: 6e-4 * left, seed=seed)
-    model.learn(STEPS.get(task, 100_000))
-    return lambda seen: np.asarray(model.predict(seen, deterministic=True)[0])
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        return np.asarray(model.predict(seen, deterministic=True)[0])
+
+    def after(*_: Any) -> bool:
+        if model.num_timesteps % 16_384 == 0:  # four updates
+            watch(act)
+        return True
+
+    model.learn(STEPS.get(task, 100_000), callback=after)
+    return act
+
+
+def curve(task: str, learn: Callable[[str, int, Watch], Act]) -> np.ndarray:
+    """Return a training's CPU seconds, and the mean return of its policy then in 16 fresh episodes, ``(points, 2)``."""
+    points, begin, away = list[tuple[float, float]](), time.process_time(), 0.0
+
+    def watch(act: Act) -> None:
+        nonlocal away
+        now = time.process_time()
+        points.append((now - begin - away, float(returns(task, act, range(FRESH, FRESH + 16))[0].mean())))
+        away += time.process_time() - now
+
+    learn(task, 0, watch)
+    return np.array(points)
 
 
 @dataclass(frozen=True)
@@ -222,7 +264,7 @@ def skills(rows: dict[Part, dict[str, Any]]) -> list[list[str]]:
     for part, row in rows.items():
         more = np.array(row["returns"]) - human
         half = 1.96 * float(more.std(ddof=1)) / len(more) ** 0.5
-        skill = (f"{more.mean() / best:.2f}", f"{half / best:.2f}") if best > 0.0 else ("", "")
+        skill = (f"{more.mean() / best:.2f}", f"{half / best:.2f}") if best > 0.0 else ("–", "–")
         crashes, spent = f"{row['crashes']}/{len(more)}", f"{row['seconds']:.0f}"
         numbers = f"{np.mean(row['returns']):.1f}", *skill
         lines.append([part.task, part.row, str(part.seed), *numbers, crashes, spent])
@@ -231,7 +273,9 @@ def skills(rows: dict[Part, dict[str, Any]]) -> list[list[str]]:
 
 def teaches(lines: list[list[str]]) -> bool:
     """Return whether the lines of a task's table are those of a first task."""
-    skill = {name: [float(line[4] or "-inf") for line in lines if line[1] == name] for name in (*IDLE, "PPO")}
+    skill = {
+        name: [float(line[4].replace("–", "-inf")) for line in lines if line[1] == name] for name in (*IDLE, "PPO")
+    }
     idle = max(x for name in IDLE for x in skill[name])
     fast = all(float(line[7]) <= 120.0 for line in lines if line[1] == "PPO")
     return idle <= 0.3 and fast and len(skill["PPO"]) >= 5 and sorted(skill["PPO"])[-4] >= 0.7

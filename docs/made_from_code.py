@@ -101,7 +101,8 @@ def _environment(name: str, cls: Any) -> list[str]:
         parts += [_described(kind)[0], *_described(kind)[1]]
     lines = [f"# {name}", "", first, "", f"![After 40 s without commands](../../tasks/{name}.png)", ""]
     if (ROOT / "docs" / "tasks" / f"{name}.gif").exists():
-        lines += [f"![Human drivers, and the searched rule below as an agent](../../tasks/{name}.gif)", ""]
+        agent = "APG" if name == "replay" else "the searched rule"
+        lines += [f"![Human drivers, and {agent} below as an agent](../../tasks/{name}.gif)", ""]
         lines += [
             f"*Six times as fast: human drivers beside the searched rule (`python docs/task_pictures.py {name}`).*",
             "",
@@ -204,8 +205,16 @@ def _meaning(function: Any) -> str:
     return text.replace("``", "`").replace("|", "\\|")
 
 
-MEASURED = {"highway": "2026-11-26", **dict.fromkeys(("ring", "follow", "platoon"), "2026-11-27")}
-"""When tables of skill were measured, where not on 2026-11-25."""
+MEASURED = {"highway": "2026-11-26"}
+"""When tables of skill were measured, where not on 2026-11-27."""
+ROWS = {
+    "human": "*Human* is `step(None)`.",
+    "rule": "*Rule* is IDM's formula as commands, its numbers found by a search that sees only returns.",
+    "PPO": "*PPO* is the ten lines of README, the last policy of each seed.",
+    "APG": "*APG* are gradients through windows of traffic, the last policy of each seed.",
+    "oracle": "*Oracle* is the rule with the numbers that are best in each of these episodes.",
+}
+"""What rows of a table of skill are."""
 
 
 def _skill(name: str) -> list[str]:
@@ -214,13 +223,13 @@ def _skill(name: str) -> list[str]:
     mine = [row[1:] for row in rows if row[0] == name]
     if not mine:
         return ["## Skill", "", f"Not measured yet: `python -m benchmarks.tasks {name}`.", ""]
+    told = " ".join(words for row, words in ROWS.items() if row in {line[0] for line in mine})
     return [
-        "## Skill", "", "(return − human)/(best row − human), 64 fresh episodes, ± 95 % of the paired difference.", "",
+        "## Skill", "", "(return − human)/(best row − human), 64 fresh episodes, ± 95 % of the paired difference; none "
+        "where no row is above human.", "",
         "| row | seed | return | skill | ± | crashes | CPU s |", "| --- | --- | --- | --- | --- | --- | --- |",
         *(f"| {' | '.join(row)} |" for row in mine), "",
-        "*Human* is `step(None)`. *Rule* is IDM's formula as commands, its numbers found by a search that sees only "
-        "returns; *PPO* the ten lines of README, last policy of each seed. "
-        f"`python -m benchmarks.tasks {name}`, {MEASURED.get(name, '2026-11-25')}, one thread, no GPU.", "",
+        f"{told} `python -m benchmarks.tasks {name}`, {MEASURED.get(name, '2026-11-27')}, one thread, no GPU.", "",
     ]  # fmt: skip
 
 

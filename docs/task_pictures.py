@@ -2,7 +2,8 @@
 
 ``python docs/task_pictures.py`` writes docs/tasks/TASK.png, docs/teach-diagram.png and docs/teach-wave.gif;
 ``python docs/task_pictures.py ring follow`` writes docs/tasks/TASK.gif of these: human drivers beside an agent, the
-searched rule of ``python -m benchmarks.tasks``.
+searched rule of ``python -m benchmarks.tasks``, in ``replay`` its APG. ``python docs/task_pictures.py curves`` trains
+the first agent, and a gradient beside PPO, and writes docs/first-agent.png.
 """
 
 from __future__ import annotations
@@ -63,12 +64,13 @@ def film(name: str, act: Any, **keywords: Any) -> list[Image.Image]:
 
 
 def moving(name: str, folder: Path = FOLDER) -> Path:
-    """Draw human drivers and the searched rule on the same episode, beside or above each other; return the file."""
+    """Draw human drivers and an agent on the same episode, beside or above each other; return the file."""
     sys.path.insert(0, str(FOLDER.parents[1]))
-    from benchmarks.tasks import GIVEN, SEEN, rule, searched
+    from benchmarks.tasks import GIVEN, SEEN, apg, rule, searched
 
-    keywords, act = GIVEN.get(name, {}), rule(name, searched(name))
-    pairs = zip(film(name, None, **keywords), film(name, act, observation=SEEN, **keywords), strict=False)
+    keywords = GIVEN.get(name, {})
+    agent = (apg(name, 0), "scaled") if name == "replay" else (rule(name, searched(name)), SEEN)
+    pairs = zip(film(name, None, **keywords), film(name, agent[0], observation=agent[1], **keywords), strict=False)
     frames = []
     for pair in pairs:
         wide, high = pair[0].size
@@ -87,6 +89,27 @@ def moving(name: str, folder: Path = FOLDER) -> Path:
     path = folder / f"{name}.gif"
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=1000 // A_SECOND, loop=0, optimize=True)
     return path
+
+
+def curves(folder: Path = FOLDER.parent) -> Path:
+    """Train on the ring and on ``follow``, and draw what agents return as they learn; return the file."""
+    sys.path.insert(0, str(FOLDER.parents[1]))
+    import matplotlib.pyplot as plt
+
+    from benchmarks.tasks import FRESH, apg, constant, curve, ppo, returns
+
+    figure, panels = plt.subplots(1, 2, figsize=(8.0, 2.8), layout="constrained")
+    for panel, task, learners in zip(panels, ("ring", "follow"), ({"PPO": ppo}, {"PPO": ppo, "APG": apg}), strict=True):
+        for name, act in {"human drivers": None, "best constant": constant(task)}.items():
+            level = float(returns(task, act, range(FRESH, FRESH + 16))[0].mean())
+            panel.axhline(level, color="0.3", ls="-" if act is None else ":", lw=1.0, label=name)
+        for name, learn in learners.items():
+            panel.plot(*curve(task, learn).T, marker=".", label=name)
+        panel.set(title=f"{task}, seed 0", xlabel="CPU time of training (s)", xlim=(0.0, None), ylim=(0.0, None))
+        panel.legend(loc="lower right", fontsize=8)
+    panels[0].set_ylabel("return, 16 fresh episodes")
+    figure.savefig(folder / "first-agent.png", dpi=120)
+    return folder / "first-agent.png"
 
 
 def teaching(folder: Path = FOLDER.parent) -> list[Path]:
@@ -110,5 +133,6 @@ def teaching(folder: Path = FOLDER.parent) -> list[Path]:
 
 
 if __name__ == "__main__":
-    for path in map(moving, sys.argv[1:]) if sys.argv[1:] else [*pictures(), *teaching()]:
+    asked: Any = (curves() if name == "curves" else moving(name) for name in sys.argv[1:])
+    for path in asked if sys.argv[1:] else [*pictures(), *teaching()]:
         print(path)

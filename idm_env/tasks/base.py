@@ -376,7 +376,11 @@ class Task(abc.ABC):
         for name, value in choices.items():
             if isinstance(value, Sequence) and "." not in str(name) and name not in self.can_draw:
                 like = nearest(str(name), (*self.can_draw, *catalogue(self._behaviour.effects)))
-                like = " All episodes have as many: draw inflow, or give a ring length=[186, 268]." if name == "vehicles" else like
+                like = (
+                    " All episodes have as many: draw inflow, or give a ring length=[186, 268]."
+                    if name == "vehicles"
+                    else like
+                )
                 own = ", ".join((*self.can_draw, "")) + "and " * bool(self.can_draw)
                 raise ValueError(
                     f"randomise.{name} cannot be drawn in task '{self.name}', where {own}parameters of drivers such as "

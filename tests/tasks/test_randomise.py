@@ -119,7 +119,11 @@ def test_demand_is_drawn_for_every_episode_and_given_at_a_reset() -> None:
             {"vehicles": [18, 26]},
             "randomise.vehicles cannot be drawn in task 'merge', where inflow, ramp_inflow",
         ),
-        ("ring", {"vehicles": [18, 26]}, "can. All episodes have as many: draw inflow, or give a ring length=[186, 268]"),
+        (
+            "ring",
+            {"vehicles": [18, 26]},
+            "can. All episodes have as many: draw inflow, or give a ring length=[186, 268]",
+        ),
     ],
 )
 def test_what_cannot_be_drawn_is_told_with_what_can(task: str, randomise: dict[str, object], said: str) -> None:
