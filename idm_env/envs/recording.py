@@ -30,9 +30,9 @@ class Recorder:
 
     Columns are those of ``idm_env.data.schema``: times (s), front bumpers, speeds and accelerations as simulated, in
     double precision, so that they are read back to the bit; gaps (m) to the leader, lanes counted from 0 on the right,
-    and ``ring_length_m`` on a ring. ``run_id`` is ``"environment-episode"``, both from 0, seeded
-    anew or not. A vehicle is its slot, with
-    ``"_trip_k"`` where vehicles enter and leave; of a recorded one ``vehicle_id`` is the record's.
+    and ``ring_length_m`` on a ring. ``run_id`` is ``"environment-episode"``, both from 0, whatever the
+    seeds. A vehicle is its slot, with ``"_trip_k"`` where vehicles enter and leave; of a recorded one ``vehicle_id`` is
+    the record's.
     """
 
     def __init__(self, task: Task, count: int) -> None:

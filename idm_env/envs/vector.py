@@ -76,9 +76,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         observation = self.batch.reset(rows, chosen.get("state"))
         self._ended[rows] = False
         self._watch(self.num_envs)
-        begun = np.zeros(self.num_envs, dtype=bool)
-        begun[rows] = True
-        return self._out(observation), self._rows.begun(begun)
+        return self._out(observation), self._rows.begun(np.isin(np.arange(self.num_envs), rows))
 
     def _masked(self, mask: Any) -> np.ndarray:
         if mask is None:

@@ -36,6 +36,7 @@ from idm_env.types import Command, Inputs, Params, State, mapped
 from idm_env.validation import nearest, whole
 
 _NORMALS_AT_ONCE = 1 << 16
+_AS_MANY = " All episodes have as many: draw inflow, or give a ring length=[186, 268]."
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -376,11 +377,7 @@ class Task(abc.ABC):
         for name, value in choices.items():
             if isinstance(value, Sequence) and "." not in str(name) and name not in self.can_draw:
                 like = nearest(str(name), (*self.can_draw, *catalogue(self._behaviour.effects)))
-                like = (
-                    " All episodes have as many: draw inflow, or give a ring length=[186, 268]."
-                    if name == "vehicles"
-                    else like
-                )
+                like = _AS_MANY if name == "vehicles" else like
                 own = ", ".join((*self.can_draw, "")) + "and " * bool(self.can_draw)
                 raise ValueError(
                     f"randomise.{name} cannot be drawn in task '{self.name}', where {own}parameters of drivers such as "

@@ -117,6 +117,8 @@ class OpenLanesTask(LanesTask):
     usual_hold: ClassVar[float | None] = 1.0
     can_draw: ClassVar[tuple[str, ...]] = ("inflow",)
     begins_with: ClassVar[tuple[str, ...]] = ("inflow",)
+    ramp: ClassVar[int | None] = None
+    """The lane whose demand is ``ramp_inflow``."""
     ranges: ClassVar[Mapping[str, Range]] = {"entry_speed": Range(1.0, 70.0, "m/s"), "inflow": FLOW}
 
     vehicles: int = 120
@@ -163,11 +165,6 @@ class OpenLanesTask(LanesTask):
                 f"every {round_trip:.0f} s each would enter anew, and the road takes {free:.0f} s. Take at least "
                 f"{math.ceil(total * self._busiest * free / 3600.0)}."
             )
-
-    @property
-    def ramp(self) -> int | None:
-        """The lane whose demand is ``ramp_inflow``."""
-        return None
 
     @property
     @abc.abstractmethod

@@ -113,7 +113,7 @@ class OpenHighwayTask(OpenLanesTask):
         return {**values, "destination": {**values["destination"], **mine}}
 
     @property
-    def ramp(self) -> int | None:
+    def ramp(self) -> int | None:  # type: ignore[override]
         """The on-ramp's lane."""
         return 0 if self._ramps[0] else None
 

@@ -54,7 +54,7 @@ class ParameterFitting:
         *,
         free: Sequence[str] | None = None,
         by: str = "all",
-        objective: str = "spacing",
+        objective: Any = "spacing",
     ) -> None:
         from idm_env.fitting.batch import Batch
         from idm_env.fitting.problem import Problem, group_of
@@ -71,8 +71,7 @@ class ParameterFitting:
         self.fixed = _fixed(simulator, params, self.free)
         # One step of the simulation per step of the environment: what is fitted is what will be driven.
         batch = Batch.stack(self.episodes, substeps=1)
-        kind: Any = objective
-        self.problem = Problem(simulator, batch, self.free, (), group, groups, objective=kind, fixed=self.fixed)
+        self.problem = Problem(simulator, batch, self.free, (), group, groups, objective=objective, fixed=self.fixed)
         self._declared = {name: catalogue(simulator.effects)[name] for name in self.free}
         self._leaves = {name: torch.zeros(len(groups), dtype=torch.float64, requires_grad=True) for name in self.free}
         self.set_values({name: _value(params, name, self._declared[name].default) for name in self.free})

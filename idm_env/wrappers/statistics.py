@@ -80,9 +80,8 @@ class VectorRecordEpisodeStatistics(VectorWrapper):
         observation, info = self.env.reset(**keywords)
         mask = (keywords.get("options") or {}).get("reset_mask")
         if mask is None or not len(self._sum):
-            self._sum = torch.zeros(self.num_envs, dtype=torch.float64, device=observation.device)
-            self._steps = torch.zeros(self.num_envs, dtype=torch.int64, device=observation.device)
-            self._over = torch.zeros(self.num_envs, dtype=torch.bool, device=observation.device)
+            none = torch.zeros(self.num_envs, device=observation.device)
+            self._sum, self._steps, self._over = none.double(), none.long(), none.bool()
         else:
             self._clear(torch.as_tensor(mask, device=observation.device))
         return observation, info
