@@ -65,7 +65,7 @@ def test_reports_are_well(chromium: None, tmp_path: Path) -> None:
     panels, _ = diagrams.panels(made), np.zeros(1)
     diagrams.write_html(tmp_path / "diagram.html", panels, "diagram")
     rows = [{f"column {i} of a table that is wide": f"{i}" * 12 for i in range(14)} for _ in range(3)]
-    page.write_page(tmp_path / "wide.html", "wide", [page.lead("x"), page.table(rows)])
+    page.write_page(tmp_path / "wide.html", "wide", [page.Block("lead", "x"), page.table(rows)])
     assert check.wrong([*pages, tmp_path / "diagram.html", tmp_path / "wide.html"]) == []
 
 

@@ -36,7 +36,7 @@ def test_a_table_is_sorted_by_values_not_by_words(tmp_path: Path) -> None:
 def test_a_click_sorts_and_no_page_scrolls_sideways(tmp_path: Path) -> None:
     """In a browser: numbers by value, down on the second click, what is not there last; at 1100 and 400 px."""
     many = [{f"column {i}": f"a long text in a cell {i}" if i % 3 else 0.123456 * i for i in range(9)}] * 2
-    written(tmp_path, page.lead("x" * 200), page.table(ROWS), page.table(many))
+    written(tmp_path, page.Block("lead", "x" * 200), page.table(ROWS), page.table(many))
     script = """<script>
     const order = () => [...document.querySelector("tbody").rows].map((r) => r.cells[0].textContent).join("");
     const heads = document.querySelectorAll("th"), said = [];

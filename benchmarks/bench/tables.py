@@ -132,13 +132,15 @@ def write(out: Path, result: Mapping[str, Any], drawn: page.Block | None) -> Non
     machine = result["machine"]
     where = f"{machine['cores']} cores of {machine['processor']}, GPU: {machine['gpu'] or 'none'}, torch "
     where += f"{machine['torch']} ({machine['vector']}), {machine['date']}"
-    blocks = [page.lead(_lead(result)), page.note(where)]
+    blocks = [page.Block("lead", _lead(result)), page.Block("note", where)]
     if drawn is not None:
         blocks.append(drawn)
     for title, rows, words in of(result):
-        blocks += [page.heading(title), page.table(rows), page.note(words)]
-    blocks += [page.heading("How"), page.text(result["physics"]), page.text(absent(result))]
-    blocks.append(page.note("All figures are in performance.json. Compare ratios: milliseconds depend on the machine."))
+        blocks += [page.Block("heading", title), page.table(rows), page.Block("note", words)]
+    blocks += [page.Block("heading", "How"), page.Block("text", result["physics"]), page.Block("text", absent(result))]
+    blocks.append(
+        page.Block("note", "All figures are in performance.json. Compare ratios: milliseconds depend on the machine.")
+    )
     page.write_page(out / "report.html", "Speed, side by side", blocks)
 
 

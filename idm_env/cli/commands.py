@@ -112,7 +112,6 @@ def _stop(number: int, frame: object) -> NoReturn:
 @app.command()
 def demo(
     data: Path | None = None,
-    columns: str | None = None,
     out: Path = options.OUT,
     seed: Annotated[int, options.Limits(0, 1e9)] = 7,
 ) -> None:
@@ -140,7 +139,7 @@ def demo(
             measured = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
             storage.write_csv(path, trajectories.table.select(measured))
             console.print(f"Ten runs of a leader and three followers: {path}", soft_wrap=True)
-        result, models = explain_one(path, out, Question(columns=columns if data else None), on_progress=report)
+        result, models = explain_one(path, out, Question(), on_progress=report)
     answers.explained(result, models, out)
 
 

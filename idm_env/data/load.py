@@ -21,6 +21,13 @@ from idm_env.data.trajectories import Trajectories, parted
 
 LAYOUTS = ("auto", "tidy", "ngsim", "openacc", "ultra_av", *drones.CSV, *drones.FILES)
 EXTENSIONS = (".csv", ".csv.gz", ".parquet", *plain.ENDINGS)
+CURES = {
+    **dict.fromkeys((".xls", ".ods"), "save the sheet as csv"), ".mat": "in MATLAB, writetable saves csv",
+    **dict.fromkeys((".mf4", ".mdf", ".blf", ".asc", ".bag", ".mcap"), "export its signals as csv, as asammdf does"),
+    **dict.fromkeys((".h5", ".hdf5", ".pkl", ".feather", ".npz", ".zarr"), "in Python, pandas saves csv and parquet"),
+    ".gpx": "give the way along the road, as csv",
+}  # fmt: skip
+"""What makes a file that is not read one that is, by its extension."""
 BATCH_BYTES, BATCH_ROWS = 16_000_000, 200_000
 """Text and rows that ``batches`` holds at a time."""
 HEAD_ROWS = 100
@@ -85,13 +92,14 @@ def _key(path: Path, *options: object) -> tuple[object, ...]:
 def files_of(paths: Sequence[Path]) -> list[Path]:
     """Return the files that paths, folders and patterns such as ``drives/*.csv`` name, in order, each once.
 
-    A ``.txt`` beside other data in a folder is taken for notes. DataError for a folder or a pattern without a file.
+    A ``.txt`` beside other data in a folder is taken for notes, and so is highD's ``…Meta.csv``. DataError for a folder
+    or a pattern without a file.
     """
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
             some = sorted(p for p in path.iterdir() if p.name.lower().endswith(EXTENSIONS) and p.is_file())
-            some = [p for p in some if p.suffix.lower() != ".txt"] or some
+            some = [p for p in some if not p.name.lower().endswith((".txt", "meta.csv"))] or some
         elif path.exists() or not glob.has_magic(str(path)):
             some = [path]
         else:
@@ -285,8 +293,8 @@ def _checked(path: Path) -> tuple[str, list[str], dict[str, Any]]:
         raise DataError(f"{path} does not exist; check the path.")
     extension = next((ending for ending in EXTENSIONS if path.name.lower().endswith(ending)), None)
     if extension is None:
-        cure = "save the sheet as csv" if path.name.lower().endswith((".xls", ".ods")) else "use one of these"
-        raise DataError(f"{path.name} has an unknown extension; {cure}: {', '.join(EXTENSIONS)}.")
+        cure = CURES.get(path.suffix.lower(), "save it as csv")
+        raise DataError(f"{path.name} has an unknown extension; {cure}. Read: {', '.join(EXTENSIONS)}.")
     if path.stat().st_size == 0:
         raise DataError(f"{path.name} is empty (0 bytes); it needs a header and rows.")
     if extension == ".parquet":
@@ -357,5 +365,5 @@ def _unreadable(path: Path, error: BaseException) -> DataError:
     if packed and not getattr(error, "errno", None):
         reason = f"as {packed}"
     elif isinstance(error, pl.exceptions.ComputeError) and (line := _odd_line(path)):
-        return DataError(f"{path.name}: {line}. Mend that line.")
+        return DataError(f"{path.name}: {line}. Mend that line, or delete the lines above the header.")
     return DataError(f"{path.name} cannot be read ({reason}); is it complete and what its extension says?")

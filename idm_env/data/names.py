@@ -25,20 +25,27 @@ UNITS |= dict.fromkeys(("position_m", "length_m", "gap_m", "ring_length_m"), LEN
 SHORT = {re.sub(r"_(id|s|m|mps2?)$", "", name): name for name in (*TIDY, *UNITS)}
 """``time`` for ``time_s``, and so on."""
 GUESSES = {
-    "vehicle_id": r"(veh|vehicle|car|track|agent|object|actor)?_?(id|no|nr|number|name)?",
-    "time_s": r"t|time|time_?stamp|seconds|clock",
-    "position_m": r"x|s|y|pos|position|local_y|station|chainage|distance|odometer|x_?pos(ition)?",
+    "vehicle_id": r"(o|obj|veh|vehicle|car|track|agent|object|actor)?_?(id|no|nr|number|name)?|fahrzeug",
+    "time_s": r"t|time|time_?(sta(mp)?|step_time)|stamp|seconds|clock|sim(ulation)?_?(sec|time)|zeit",
+    "position_m": r"x|s|y|pos|position|local_y|station|chainage|distance|odometer|x_?pos(ition)?|weg|vehicle_pos",
     "run_id": r"(run|trip|drive|recording|scenario|scene|session|trajectory)_?(id|no|nr)?",
     "leader_id": r"(lead|leader|preceding|predecessor|front)_?(id|vehicle|car)*",
-    "lane": r"lane_?(id|index|no|nr|number)?",
-    "speed_mps": r"v|vx|vel|velocity|speed",
+    "lane": r"(vehicle_)?lane_?(id|index|no|nr|number)?|spur|fahrstreifen",
+    "speed_mps": r"v|vx|vel|velocity|(vehicle_)?speed|geschwindigkeit",
     "length_m": r"(veh|vehicle)?_?(l|len|length)",
     "gap_m": r"gap|space_?gap|spacing|net_distance",
 }
 """What a column is perhaps called that has no tidy name."""
+ON_EARTH = dict.fromkeys(("longitude", "lon", "lng", "easting"), "x")
+ON_EARTH |= dict.fromkeys(("latitude", "lat", "northing"), "y")
+"""Coordinates that point east, and north."""
 MOST_ACROSS, WIDEST = 0.25, 12.0
 """Vehicles that move across by such a share of their way, and one by more than three lanes (m), have turned."""
-_X, _V, _SENSOR = r"(x|s|y|pos|position|loc|local_?y)", r"(v|vel|velocity|spd|speed)", r"(radar|lidar|sensor)?_?"
+_X, _V, _SENSOR = (
+    r"(x|s|y|pos|position|loc|local_?y)",
+    r"(v|vel|velocity|spd|speed)",
+    r"(radar|lidar|sensor|acc|can|obj(ect)?|mobileye)?_?",
+)
 _WHO = {"follower": r"(f|fv|sv|fav|fol|foll|follower|following|ego|own|host|subject|self)",
         "leader": r"(l|lv|pv|lead|leader|leading|preceding|front|target)"}  # fmt: skip
 PAIRS = {
@@ -174,7 +181,10 @@ def guessed(columns: list[str]) -> str:
         elif name in REQUIRED:
             guesses[name] = "?"
     if plane and guesses.get("position_m") == "?":
-        remarks.append(". x and y are two coordinates: position_m is the way along the road, and lane a number")
+        two = " and ".join(plane[axis] for axis in "xy")
+        remarks.append(f". {two} are two coordinates: position_m is the way along the road, and lane a number")
+    if len(several := [column for column in columns if re.fullmatch(r"(?i)[a-z_]*[a-z]_?\d+", column)]) > 3:
+        remarks.append(f". {listed(several, 4)} look like vehicles side by side: give a row per vehicle and time")
     frame = next((column for column in columns if re.fullmatch(r"(?i)frame_?(id|no|nr|number)?", column)), None)
     if frame is not None and guesses.get("time_s") == "?":
         guesses["time_s"] = f"{frame}[0.04]"
@@ -204,12 +214,13 @@ def _pair(columns: list[str]) -> str:
 
 
 def coordinates(columns: list[str]) -> dict[str, str]:
-    """Return the columns of a header that are coordinates of a plane: x and y, as they are or as ``x_m``, ``xCenter``.
+    """Return the columns of a header that are two coordinates: x and y, as ``x_m`` or ``xCenter``, too, or on earth.
 
     Nothing where one of them is missing.
     """
-    noise = r"[\[(].*|(?<=[xy])_?m$|[^a-z]|pos(ition)?|utm|local|center"
-    plane = {axis: column for column in columns if (axis := re.sub(noise, "", column.lower())) in ("x", "y")}
+    noise = r"[\[(].*|(?<=[xy])_?m$|[^a-z]|pos(ition)?|utm|local|center|coord(inate)?|vehicle|obj(ect)?"
+    plain = {column: re.sub(noise, "", column.lower()) for column in columns}
+    plane = {ON_EARTH.get(axis, axis): column for column, axis in plain.items() if axis in ("x", "y", *ON_EARTH)}
     return plane if len(plane) == 2 else {}
 
 

@@ -23,15 +23,20 @@ import polars as pl
 
 from idm_env.data import ngsim
 from idm_env.data.errors import DataError
+from idm_env.data.names import UNITS
+from idm_env.data.schema import TIDY
 from idm_env.data.sizes import read_whole
 
 ENDINGS = (".txt", ".tsv", ".fzp", ".xml", ".xlsx", ".zip", ".txt.gz", ".xml.gz")
 """Of files that are read by way of a copy, beside those of csv that need one."""
 _VISSIM = (
-    "SIMSEC=time_s NO=vehicle_id LANE\\LINK\\NO=run_id LANE\\INDEX=lane POS=position_m SPEED=speed_kmh LENGTH=length_m"
+    "SIMSEC=time_s NO=vehicle_id LANE\\LINK\\NO=run_id LANE\\INDEX=lane POS=position_m SPEED=speed_kmh LENGTH=length_m "
+    "t=time_s VehNr=vehicle_id Link=run_id Lane=lane x=position_m v=speed_kmh Length=length_m"
 )
 VISSIM = dict(pair.split("=") for pair in _VISSIM.split())
-"""Names of tidy columns for those of Vissim."""
+"""Names of tidy columns for those of Vissim, of today and of old, in the units that no line above the header tells."""
+TOLD_UNITS = {"m": "m", "ft": "ft", "km/h": "kmh", "mph": "mph", "m/s": "mps", "ft/s": "fps"}
+UNIT_NAMES = {"", "-", *(unit for units in UNITS.values() for unit in units)}
 FCD = {"id": "vehicle_id", "pos": "position_m", "speed": "speed_mps", "leaderID": "leader_id", "leaderGap": "gap_m"}
 FCD |= {"lane": "lane", "type": "vehicle_class"}
 """Attributes of a vehicle of SUMO's that are read, and their tidy columns."""
@@ -91,24 +96,50 @@ def _rewritten(path: Path, files: ExitStack) -> Iterable[str] | None:
     numbers = len(cells) > 2 and all(re.fullmatch(r"[+-]?\d*\.?\d+(e[+-]?\d+)?", cell.strip(), re.I) for cell in cells)
     ends = [row[-1:] for row in lines[1:20]]
     trailing = bool(ends) and set(ends) < {",", ";"} and first.count(ends[0]) + 1 == lines[1].count(ends[0])
-    odd = first.startswith(("#", "$", "*")) or first.lower().startswith("sep=")
-    if not (odd or numbers or trailing or encoding != "utf-8" or path.name.lower().endswith((".zip", ".txt.gz"))):
+    odd = first.startswith(("#", "$", "*")) or first.lower().startswith("sep=") or name.endswith(".fzp")
+    comma = max(",;\t", key=first.count)
+    units = [cell.strip().strip("[]()") for cell in lines[1].split(comma)] if lines[1:] else []
+    has_units = sum(map(bool, units)) > 1 and {*units} <= UNIT_NAMES
+    if not (
+        odd
+        or has_units
+        or numbers
+        or trailing
+        or encoding != "utf-8"
+        or path.name.lower().endswith((".zip", ".txt.gz"))
+    ):
         return None
     lines = (head + read_whole(file, path.name)).decode(encoding, "replace").removeprefix("\ufeff").splitlines()
     mark = lines.pop(0)[4:] if first.lower().startswith("sep=") else ""
-    header = next((line for line in lines if line.startswith("$VEHICLE:")), None)
+    if name.endswith(".fzp"):
+        return _of_vissim(lines)
     rows = [line for line in lines if line.strip() and not line.startswith(("#", "$", "*"))]
-    if header is not None:
-        return (f"{row}\n" for row in [";".join(VISSIM.get(n, n) for n in header.partition(":")[2].split(";")), *rows])
     if numbers and len(cells) not in ngsim.WITHOUT_HEADER:
         shown = ", ".join(cells[:4])
         raise DataError(f"{path.name}: the first line holds numbers, {shown} …: it has no header. Add a line of names.")
     if numbers:
         rows = [" ".join(ngsim.WITHOUT_HEADER[len(cells)]), *rows]
         rows = [",".join(re.split(r"[,;\t]|\s+", row.strip())) for row in rows]
+    if has_units:
+        pairs = zip(first.split(comma), units, strict=False)
+        rows = [comma.join(n if n in TIDY or not unit else f"{n} [{unit}]" for n, unit in pairs), *rows[2:]]
     if trailing:
         rows = [first, *(row[:-1] for row in rows[1:])]
     return (f"{row.replace(mark, TAB) if mark not in ('', ',', ';') else row}\n" for row in rows)
+
+
+def _of_vissim(lines: list[str]) -> Iterator[str]:
+    """Yield Vissim's vehicle record as csv; units are those of the lines above its header, where these tell them."""
+    begin = next((i for i, line in enumerate(lines) if line.startswith("$VEHICLE:") or "VehNr;" in line), -1)
+    matches = (re.match(r"[* ]*(\S+?)\s*:.*\[(\S+)\]", line) for line in lines[:begin])
+    units = {m[1]: TOLD_UNITS[m[2]] for m in matches if m and m[2] in TOLD_UNITS}
+    for row in lines[begin:] if begin >= 0 else ():
+        cells = [cell.strip() for cell in row.removeprefix("$VEHICLE:").rstrip("; ").split(";")]
+        if row is lines[begin]:
+            for i, n in enumerate(cells):
+                cells[i] = VISSIM.get(n, n)
+                cells[i] = f"{cells[i].rpartition('_')[0]}_{units[n]}" if n in units and n in VISSIM else cells[i]
+        yield ";".join(cells) + NL if row.strip() else ""
 
 
 def _of_sheet(path: Path) -> Iterable[str]:
@@ -135,7 +166,7 @@ def _of_sumo(path: Path, head: bytes, file: Any) -> Iterator[str]:
             for event, element in parser.read_events():
                 root = root or element.tag
                 if root != "fcd-export":
-                    raise DataError(f"{path.name} is XML of <{root}>; of SUMO's files that of --fcd-output is read.")
+                    raise DataError(f"{path.name} is XML of <{root}>; of XML SUMO's --fcd-output is read. Export csv.")
                 time = element.get("time", "") if element.tag == "timestep" else time
                 if event == "end" and element.tag == "vehicle":
                     if not names:

@@ -5,21 +5,13 @@ from __future__ import annotations
 import polars as pl
 
 from idm_env.data.errors import DataError, Repair, listed
-from idm_env.data.names import guessed
+from idm_env.data.names import SHORT, UNITS, guessed
 
-FOOT_M, MILE_M = 0.3048, 1609.344
 NAMED: dict[str, tuple[tuple[str, float], ...]] = {
-    "time_s": (("time_ms", 1e-3),),
-    "position_m": (("position_ft", FOOT_M), ("position_feet", FOOT_M), ("position_km", 1000.0)),
-    "speed_mps": (
-        ("speed_kmh", 1 / 3.6), ("speed_kph", 1 / 3.6), ("speed_mph", MILE_M / 3600), ("speed_ftps", FOOT_M),
-        ("speed_fps", FOOT_M),
-    ),
-    "accel_mps2": (("accel_ftps2", FOOT_M), ("accel_fps2", FOOT_M)),
-    "length_m": (("length_ft", FOOT_M), ("length_feet", FOOT_M)),
-    "gap_m": (("gap_ft", FOOT_M), ("gap_feet", FOOT_M)),
+    name: tuple((f"{stem}_{unit}", factor) for unit, factor in UNITS[name].items() if factor != 1.0 and unit.isalpha())
+    for stem, name in SHORT.items() if name in UNITS
 }  # fmt: skip
-"""Columns that name another unit, and what they are multiplied by."""
+"""Columns that name another unit, such as ``position_ft``, and what they are multiplied by."""
 _OTHER_UNITS = {other for others in NAMED.values() for other, _ in others}
 
 
@@ -32,6 +24,8 @@ def check(columns: list[str], source: str) -> None:
     """Raise DataError if the header is that of no tidy table."""
     if matches(columns):
         return
+    if source.lower().endswith("meta.csv"):
+        raise DataError(f"{source} describes recordings or tracks, and has none. Name the file of tracks beside it.")
     raise DataError(
         f"{source}: no known layout has the columns {listed(columns, 8)}; a tidy table needs vehicle_id, time_s and "
         f"position_m. Name them: {guessed(columns)}"

@@ -119,7 +119,8 @@ def explain_sets(
         rows = parts.summaries()
         page.ASKED.set(command)
         storage.write_csv(out / "sets.csv", pl.DataFrame(rows, infer_schema_length=None).select(COLUMNS))
-        page.write_page(out / "report.html", f"{len(rows)} data sets", _page(rows))
+        template = Path(__file__).with_name("sets.html")
+        page.write_page(out / "report.html", f"{len(rows)} data sets", template=template, sets=rows)
         parts.remove()
     return rows
 
@@ -138,26 +139,3 @@ def _explain_set(one: _Set, on_progress: OnProgress) -> None:
         "effects": " ".join(finding["effect"] or finding["label"] for finding in report["found"]),
         "gap_rmse_before_m": before and before["gap_rmse_m"], "gap_rmse_after_m": after and after["gap_rmse_m"],
     })  # fmt: skip
-
-
-def _page(rows: Sequence[dict[str, Any]]) -> list[page.Block]:
-    verdicts: dict[str, int] = {}
-    for row in rows:
-        verdicts[row["verdict"]] = verdicts.get(row["verdict"], 0) + 1
-    counts = ", ".join(f"{verdict.replace('_', ' ')}: {count}" for verdict, count in sorted(verdicts.items()))
-    table = [
-        {
-            "data set": row["set"], "verdict": row["verdict"].replace("_", " "), "effects": row["effects"],
-            "gap RMSE before (m)": row["gap_rmse_before_m"], "after (m)": row["gap_rmse_after_m"],
-            "in words": row["sentence"],
-        }
-        for row in rows
-    ]  # fmt: skip
-    return [
-        page.lead(f"{counts}."),
-        page.table(table, digits={"gap RMSE before (m)": 2, "after (m)": 2}),
-        page.note(
-            "Errors are of each set's test runs. Each set was judged by itself: over many sets some verdicts "
-            "are wrong by chance. Every set has its own report, in the folder of its name."
-        ),
-    ]

@@ -89,7 +89,8 @@ def drift_file(
             "versions": page.versions(),
         }  # fmt: skip
         storage.write_json(out / "report.json", result)
-        page.write_page(out / "report.html", f"How the drivers of {trajectories.source} drift", _page(result))
+        title, template = f"How the drivers of {trajectories.source} drift", Path(__file__).with_name("drift.html")
+        page.write_page(out / "report.html", title, template=template, r=result, tables=tables, picture=_picture)
         store.remove()
         return result
 
@@ -163,16 +164,11 @@ def tables(report: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
     }
 
 
-def _page(report: dict[str, Any]) -> list[page.Block]:
-    blocks = [page.lead(report["sentence"])]
-    if scores := report["kept_back"]["scores"]:
-        figure, ((axis,),) = page.figure(size=(7.0, 3.2))
-        for model in dict.fromkeys(row["model"] for row in scores):
-            rows = [row for row in scores if row["model"] == model]
-            axis.plot([r["ahead_s"] for r in rows], [r["gap_crps_m"] for r in rows], marker=".", label=model)
-        axis.set(xlabel="time ahead (s)", ylabel="CRPS of the gap (m)", ylim=(0.0, None))
-        axis.legend(frameon=False)
-        blocks.append(page.picture(figure, "Forecasts of drivers kept back: the lower, the better."))
-    for title, rows in tables(report).items():
-        blocks += [page.heading(title), page.table(rows)]
-    return [*blocks, page.heading("Data"), page.text(report["data"]["account"])]
+def _picture(scores: list[dict[str, Any]]) -> page.Block:
+    figure, ((axis,),) = page.figure(size=(7.0, 3.2))
+    for model in dict.fromkeys(row["model"] for row in scores):
+        rows = [row for row in scores if row["model"] == model]
+        axis.plot([r["ahead_s"] for r in rows], [r["gap_crps_m"] for r in rows], marker=".", label=model)
+    axis.set(xlabel="time ahead (s)", ylabel="CRPS of the gap (m)", ylim=(0.0, None))
+    axis.legend(frameon=False)
+    return page.picture(figure, "Forecasts of drivers kept back: the lower, the better.")

@@ -18,7 +18,12 @@ def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> 
     storage.write_json(out / "report.json", report)
     several = "" if report["scenarios"] == 1 else "s"
     title = f"Predictions of {report['agents']} agents in {report['scenarios']} scenario{several}"
-    names: dict[str, Any] = {"r": report, "pictures": page.gallery(pictures), "metrics": metrics, "groups": groups}
+    names: dict[str, Any] = {
+        "r": report,
+        "pictures": page.Block("gallery", rows=tuple(pictures)),
+        "metrics": metrics,
+        "groups": groups,
+    }
     names |= {"shortened": page.shortened, "enough_scenes": ENOUGH_SCENES}
     page.write_page(out / "report.html", title, template=Path(__file__).with_name("predict.html"), **names)
 

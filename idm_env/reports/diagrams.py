@@ -246,7 +246,7 @@ def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
     several = f" {len(drawn)} panels, one per run and lane, the largest first." if len(drawn) > 1 else ""
     words = f"One line per vehicle, coloured by speed.{several}"
     thinned = f" Every {stride}th sample is drawn." if stride > 1 else ""
-    page.write_page(path, title, [page.note(words + thinned), page.html(fragment)])
+    page.write_page(path, title, [page.Block("note", words + thinned), page.Block("html", fragment)])
 
 
 def axes_of(panel: Panel, drawn: Sequence[Panel]) -> tuple[tuple[float, float], tuple[str, str]]:

@@ -33,12 +33,12 @@ NEXT = {
 class Asked(NamedTuple):
     """Command line of a user: the command, its files, and the options of reading them."""
 
-    command: str
+    command: str = ""
     files: tuple[str, ...] = ()
     options: tuple[tuple[str, str], ...] = ()
 
 
-_NOTHING = Asked("")
+_NOTHING = Asked()
 ASKED: ContextVar[Asked] = ContextVar("ASKED", default=_NOTHING)
 
 
@@ -77,39 +77,13 @@ class Cell:
     marked: bool = False
 
 
-def heading(text: str) -> Block:
-    """Return a section's heading."""
-    return Block("heading", text)
-
-
-def lead(text: str) -> Block:
-    """Return the paragraph that says the result."""
-    return Block("lead", text)
-
-
-def text(words: str) -> Block:
-    """Return a paragraph."""
-    return Block("text", words)
-
-
-def note(words: str) -> Block:
-    """Return a paragraph in small print."""
-    return Block("note", words)
-
-
-def table(
-    rows: Sequence[Mapping[str, Any]],
-    columns: Sequence[str] | None = None,
-    *,
-    digits: Mapping[str, int] | None = None,
-    first: bool = False,
-) -> Block:
+def table(rows: Sequence[Mapping[str, Any]], digits: Mapping[str, int] | None = None, first: bool = False) -> Block:
     """Return a table of rows by column name; floats with four significant digits, or ``digits`` behind the point.
 
     A reader sorts it by any column; a ``Cell`` says what its text is sorted by. ``first`` sets the first row off from
     the others.
     """
-    names = tuple(columns or (rows[0] if rows else ()))
+    names = tuple(rows[0] if rows else ())
     cells = tuple(tuple(_cell(row.get(name), (digits or {}).get(name)) for name in names) for row in rows)
     return Block("table", "first" if first else "", columns=names, rows=cells)
 
@@ -137,21 +111,6 @@ def shortened(items: Sequence[str], most: int = 100) -> list[str]:
     """Return the first ``most`` items, and how many there are more."""
     more = len(items) - most
     return [*items[:most], *([f"… and {more} more, in report.json."] if more > 0 else [])]
-
-
-def lights(rows: Iterable[tuple[str, str, str]]) -> Block:
-    """Return one card per (name, ``better``, ``same`` or ``worse``, words); the state is a word and a colour, or ""."""
-    return Block("lights", rows=tuple(rows))
-
-
-def html(markup: str) -> Block:
-    """Return markup that goes into the page as it is; whoever writes it escapes what a file said."""
-    return Block("html", markup)
-
-
-def gallery(figures: Iterable[Block]) -> Block:
-    """Return figures side by side, as many in a row as there is room for."""
-    return Block("gallery", rows=tuple(figures))
 
 
 def picture(figure: Figure, caption: str, narrow: Figure | None = None) -> Block:

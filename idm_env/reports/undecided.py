@@ -48,6 +48,6 @@ def write(trajectories: Trajectories, cure: str, out: Path, inputs: Iterable[Pat
             (folder / name).unlink(missing_ok=True)
         write_json(folder / "report.json", report)
         picture = page.picture(space_time(trajectories), "The recording: a line per vehicle, coloured by speed.")
-        blocks = [page.lead(sentence), page.lights(cards), picture]
+        blocks = [page.Block("lead", sentence), page.Block("lights", rows=tuple(cards)), picture]
         page.write_page(folder / "report.html", "One recording cannot tell what IDM lacks", blocks)
     return report

@@ -14,7 +14,7 @@ import polars as pl
 import pytest
 
 from idm_env.data import DataError, Trajectories, load
-from idm_env.data.load import read
+from idm_env.data.load import files_of, read
 from idm_env.trajectories.spool import Spool
 from tests.data.tables import kinds
 from tests.test_commands_read_alike import alike, tracks
@@ -487,3 +487,78 @@ def test_the_option_for_a_pair_is_printed_as_it_is_needed(header: str, tmp_path:
 def test_half_a_pair_is_refused(pair: str, words: str, tmp_path: Path) -> None:
     WIDE.write_csv(tmp_path / "a.csv")
     assert words in refused(tmp_path / "a.csv", tmp_path, pair)
+
+
+def test_a_row_of_units_below_the_header_names_the_units(tmp_path: Path) -> None:
+    rows = [f"{t:.1f},{3.6 * v:.2f},{25.0 - t / 10:.2f},-0.1" for t, v in zip(TIMES, SPEED, strict=True)]
+    file = tmp_path / "can.csv"
+    file.write_text("\n".join(["Time,EgoSpeed,ACC_Distance,ACC_RelSpeed", "s,km/h,m,m/s", *rows]) + "\n")
+    with pytest.raises(DataError) as caught:
+        load(file)
+    option = (
+        "time_s=Time [s],follower.speed_mps=EgoSpeed [km/h],gap_m=ACC_Distance [m],range_rate_mps=ACC_RelSpeed [m/s]"
+    )
+    assert f"--pair '{option}'" in str(caught.value)
+    speeds = load(file, columns=option).table.filter(vehicle_id="follower")["speed_mps"]
+    assert np.allclose(speeds, SPEED, atol=0.01)
+
+
+VISSIM = "  {:.1f}; {}; 1; 1; {:.3f}; {:.2f};"
+
+
+@pytest.mark.parametrize(
+    ("head", "foot", "speed"),
+    [
+        ("$VISION\n* POS: Position [ft]\n* SPEED: Speed [mph]\n$VEHICLE:SIMSEC;NO;LANE\\LINK\\NO;LANE\\INDEX;POS;SPEED",
+         0.3048, 0.44704),
+        ("Vehicle Record\n\nx : Link Coordinate [m]\nv : Speed [km/h]\n\n  t;  VehNr;  Link; Lane;  x;  v;",
+         1.0, 1 / 3.6),
+    ],
+    ids=["feet and miles", "of old"],
+)  # fmt: skip
+def test_records_of_vissim_have_the_units_that_they_tell(head: str, foot: float, speed: float, tmp_path: Path) -> None:
+    rows = [
+        VISSIM.format(t, n, (start + x) / foot, v / speed)
+        for n, start in enumerate(STARTS) for t, x, v in zip(TIMES, WAY, SPEED, strict=True)
+    ]  # fmt: skip
+    (tmp_path / "a.fzp").write_text("\n".join([head, *rows]) + "\n")
+    found = read_alike(tmp_path / "a.fzp", tmp_path)
+    assert leaders(found) == CHAIN and np.allclose(found.table["gap_m"].drop_nulls(), 25.5, atol=0.01)
+    assert np.allclose(found.table["speed_mps"].unique().sort(), SPEED, atol=0.01)
+
+
+def test_a_folder_of_highd_as_it_is_delivered_has_its_tracks(tmp_path: Path) -> None:
+    text = "frame,id,x,width,xVelocity,laneId\n" + "".join(
+        f"{k},{n},{50 - 20 * n + 0.8 * k},4.5,20,5\n" for n in (0, 1) for k in range(9)
+    )
+    (tmp_path / "01_tracks.csv").write_text(text)
+    (tmp_path / "01_tracksMeta.csv").write_text("id,width,height\n1,4.5,2\n")
+    assert files_of([tmp_path]) == [tmp_path / "01_tracks.csv"]
+    with pytest.raises(DataError, match="Name the file of tracks beside it"):
+        load(tmp_path / "01_tracksMeta.csv")
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("Fahrzeug;Zeit [s];Weg [m];Geschwindigkeit [km/h];Spur",
+         "position_m=Weg [m],lane=Spur,speed_mps=Geschwindigkeit [km/h]"),
+        ("oid;ent;laneIndex;xCoord;yCoord;timeSta;speed", "vehicle_id=oid,time_s=timeSta,position_m=?"),
+        ("vehicle_id,stamp_ns,s,v", "time_s=stamp_ns[ns],position_m=s"),
+        ("id,time,latitude,longitude", "longitude and latitude are two coordinates"),
+        ("time,x1,x2,v1,v2", "look like vehicles side by side: give a row per vehicle and time"),
+    ],
+)  # fmt: skip
+def test_a_header_that_is_unknown_is_answered_with_a_line_to_copy(header: str, words: str, tmp_path: Path) -> None:
+    cells = len(header.replace(",", ";").split(";"))
+    (tmp_path / "a.csv").write_text(f"{header}\n" + (";" if ";" in header else ",").join("1" * cells) + "\n")
+    assert words in refused(tmp_path / "a.csv", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("ending", "cure"), [("mat", "writetable"), ("mf4", "asammdf"), ("ods", "save the sheet as csv")]
+)
+def test_a_file_of_another_program_is_refused_with_how_to_export_it(ending: str, cure: str, tmp_path: Path) -> None:
+    (tmp_path / f"a.{ending}").write_bytes(bytes(9))
+    with pytest.raises(DataError, match=cure):
+        load(tmp_path / f"a.{ending}")

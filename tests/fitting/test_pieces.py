@@ -31,7 +31,7 @@ def no_pictures() -> Iterator[None]:
     """Pictures take most of the time of so small a fit, and test_job looks at them."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("examples", "residuals", "parameters"):
-            patch.setattr(pictures, name, lambda *_: page.text("a picture"))
+            patch.setattr(pictures, name, lambda *_: page.Block("text", "a picture"))
         patch.setattr(pictures, "space_time", lambda *_: [])
         yield
 
