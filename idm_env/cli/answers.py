@@ -77,7 +77,7 @@ def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> Non
     if result["bases"]:
         console.print(laws(result["bases"]), soft_wrap=True, highlight=False)
     files = sorted(result["models"].items(), key=lambda item: item[0] != "model.yaml")
-    best = ", which predicts best" if len(files) > 1 else ""
+    best = ", what the verdict says" if len(files) > 1 else ""
     words = (f"{file} is {name}{best if not i else ''}" for i, (file, name) in enumerate(files))
     console.print("; ".join(words), highlight=False)
     if (out / FOUND).is_file():

@@ -6,6 +6,7 @@ One of them is there once more, with the strengths of effects that are each driv
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 from idm_env.discovery import model as terms
@@ -42,12 +43,19 @@ class Law(NamedTuple):
     @property
     def parameters(self) -> int:
         """Number of parameters that every driver has of his own."""
-        return len(self.model.catalogue.own)
+        return len(self.model.catalogue.own) - len(self.model.catalogue.without)
+
+    @property
+    def at_bounds(self) -> dict[str, int]:
+        """How many drivers have each of these parameters at a bound, in a half of their time; none if not judged."""
+        return {} if self.errors.theta is None else self.model.catalogue.at_bounds(self.errors.theta)
 
     @property
     def title(self) -> str:
         """Plain name."""
         title = self.law.title or self.law.kind
+        if self.model.catalogue.without:
+            return f"{title} without {' and '.join(self.model.catalogue.without).replace('_', ' ')}"
         if not self.own:
             return title
         *others, last = (ALL[name].title for name in self.own)
@@ -96,8 +104,12 @@ def compared(
 
     for law in others:
         add(Hypothesis(null.terms, Catalogue(named, law, located=False)))
+    # Whether a part of a better law does the work, or all of it, is told beside it.
+    better = best_of(laws)
+    for name in better.law.spared if better.against else ():
+        add(Hypothesis(null.terms, replace(better.model.catalogue, without=(name,))))
     # A better law comes first: what it lacks is sought, before anything is put down to its drivers.
-    has_better = bool(best_of(laws).against)
+    has_better = bool(better.against)
     add(personal(null, own))
     if laws[-1].is_better and not has_better:
         for law in others:
@@ -133,7 +145,8 @@ def rows(laws: Iterable[Law]) -> list[LawErrors]:
     """Return the rows of a report's table of laws."""
     return [
         LawErrors(
-            each.law.kind, each.title, each.law.equation, list(each.own), each.parameters, each.at_best,
+            each.law.kind, each.title, each.law.equation, list(each.own), list(each.model.catalogue.without),
+            each.parameters, {name: n for name, n in each.at_bounds.items() if n}, each.at_best,
             **each.errors.summary(), against=against_rows(each.against, not each.at_best),
         )
         for each in laws

@@ -40,9 +40,7 @@ def folds_of(runs: Sequence[str], kept: Sequence[str], seed: int) -> np.ndarray:
 def values_of(problem: Problem, solution: Solution, runs: Sequence[str], fold: np.ndarray) -> np.ndarray:
     """Return φ [folds, Q] without the runs of each fold; ``problem`` is what φ was fitted to, ``runs`` are all."""
     of_run = fold[[runs.index(run) for run in problem.rows.records.runs]]
-    moved = without(problem, solution, of_run, int(fold.max()) + 1)
-    result: np.ndarray = solution.values + moved
-    return result
+    return np.asarray(solution.values + without(problem, solution, of_run, int(fold.max()) + 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +72,9 @@ def crossed(
 
     A driver's parameters are fitted to every second block of his time and judged between, then the other way round;
     their population and φ come from other folds. Every error has the calibration that serves it: closed-loop
-    simulation that of closed-loop simulation, with the weight of the population that other folds choose; predictions
-    5 s ahead the same, or that of whitened predictions 5 s ahead, whose likelihood weighs the population by itself:
-    whichever leaves less, whitened by the noise of the model's own errors. So a model's errors are its own, whatever
-    it is compared with.
+    simulation that of closed-loop simulation, with the weight of the population that other folds choose. Predictions
+    5 s ahead have the same or, where that leaves less, that of predictions whitened by the noise of the model's errors.
+    So a model's errors are its own, whatever it is compared with.
 
     Args:
         records: All runs.
@@ -88,9 +85,8 @@ def crossed(
         pooled: Whether every driver is the population's middle.
     """
     rows, own = whole(records), model.catalogue.own
-    is_calibrated = start is not None
     problem, theta = judge.unweighed(
-        records, model, values.mean(0), first_prior(own), start=start, calibrated=is_calibrated
+        records, model, values.mean(0), first_prior(own), start=start, calibrated=start is not None
     )
     second = judge.halves(rows)
     halves = [replace(rows, valid=part).settled() for part in (rows.valid & ~second, second)]
@@ -106,8 +102,8 @@ def crossed(
         mine = [half.some(of_row == k) for half in halves]
         frozen = model.fixed(values[k])
         if pooled:
-            everyone = np.broadcast_to(prior.centre, near.shape)
-            parts[int(k)] = _Fold(prior, frozen, {POOLED_S: everyone}, {POOLED_S: np.ones(1)})
+            everyone = {POOLED_S: np.broadcast_to(prior.centre, near.shape)}
+            parts[int(k)] = _Fold(prior, frozen, everyone, {POOLED_S: np.ones(1)})
         else:
             parts[int(k)] = _weighed(mine, prior, frozen, near)
     gap, speed, thetas = _simulated(rows, second, fold, parts)
@@ -124,7 +120,8 @@ def crossed(
     further = EMPTY
     if longer is not None:
         further = _predicted(replace(problem, rows=longer), model, values, fold, thetas)[:, -1]
-    return judge.Judged(rows, gap, speed, ahead[:, -1], short.record, further)
+    judged = [th[:, np.unique(rows.group[of_row == k])] for k, th in thetas.items()]
+    return judge.Judged(rows, gap, speed, ahead[:, -1], short.record, further, np.concatenate(judged, axis=1))
 
 
 def in_blocks(records: Records) -> Rows | None:

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -112,12 +112,9 @@ def discover(
         progress("final check", 0, 0, "test set")
         return Evaluation(searching, decided.null, prepared, test, by == "driver", seed, errors), decided
 
-    def on_law(*state: Any) -> None:
-        progress("other laws", *state)
-
     evaluation, decided = searched(Hypothesis(known_terms, march.Catalogue.of(extra, prepared.period, law)), "explain")
     try:
-        discovery = finished(trajectories, evaluation, decided, refused, by, on_law, searched)
+        discovery = finished(trajectories, evaluation, decided, refused, by, partial(progress, "other laws"), searched)
     except Exception as error:
         if out is not None:
             path = write_search(out, decided, prepared, by)

@@ -74,7 +74,7 @@ class Discovery:
 
     @property
     def model(self) -> SavedModel:
-        """The model that predicts best of those compared on the test set."""
+        """The model that the verdict is about."""
         return self.models["model.yaml"]
 
 
@@ -164,7 +164,8 @@ def _on_the_best(
     # In a law's loop there is room for all candidates.
     room = evaluation.searching.base.catalogue
     effects = tuple((best.model.catalogue.by_name | room.by_name).values())
-    catalogue = replace(room, effects=effects, base=best.law, personal=best.own)
+    own = best.model.catalogue
+    catalogue = replace(room, effects=effects, base=best.law, personal=own.personal, without=own.without)
     model = Hypothesis(best.model.terms, catalogue)
     beyond, more = searched(model, "explain_law", best.errors)
     other, its_last = judgement_of(beyond, more)

@@ -97,7 +97,7 @@ def found(laws: Iterable[Law], one: Judged, among: Among, seed: int) -> Kinds | 
         among: Judges a model for the drivers of some records [records].
         seed: Of the bootstrap.
     """
-    fair = [law for law in laws if not law.at_best and not law.own]
+    fair = [law for law in laws if not (law.at_best or law.own or law.model.catalogue.without)]
     if len(fair) < 2:
         return None
     logs = np.stack([_logs(law.errors) for law in fair])

@@ -39,6 +39,8 @@ class Judged:
     ahead_record: np.ndarray
     further: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Errors of the gap 10 s ahead [windows of 10 s] with the drivers of those 5 s ahead; empty on short blocks."""
+    theta: np.ndarray | None = None
+    """log θ [2, G, P] of predictions 5 s ahead, of groups that are judged, from each half of their time."""
 
     @cached_property
     def gap_error(self) -> np.ndarray:
@@ -171,11 +173,10 @@ def scaled(problem: Problem, model: Hypothesis, values: np.ndarray, theta: np.nd
 
 def closed_loop_squares(records: Records, s: Solution) -> np.ndarray:
     """Return squared gap errors (m²) of closed-loop simulation [units], θ fitted to it; one counts 30 m at most."""
-    model, values, prior = s.model, s.values, s.prior
-    fitted = calibrate(records, model, values, prior, start=s.theta)
+    fitted = calibrate(records, s.model, s.values, s.prior, start=s.theta)
     rows = whole(records)
-    problem = Problem(rows, None, prior)
-    errors = problem.errors(fitted.theta[None], model.fixed(values), np.zeros((1, 0)))[0]
+    problem = Problem(rows, None, s.prior)
+    errors = problem.errors(fitted.theta[None], s.model.fixed(s.values), np.zeros((1, 0)))[0]
     return units(records).sums(rows.record, (np.clip(errors, -30.0, 30.0) ** 2).sum(1))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from idm_env.discovery.search import Search
 from idm_env.discovery.selection import Decided
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Problem, Solution
-from idm_env.discovery.verdict import Reason, Refusal, improves, mean_ratio
+from idm_env.discovery.verdict import Reason, Refusal, improves
 from idm_env.reports.undecided import GROUPS
 
 Calibration = tuple[Solution, judge.Judged | None]
@@ -63,11 +64,6 @@ class Judgement:
         return compare(self.before, self.after, self.seed)
 
     @property
-    def mean_ratio(self) -> float:
-        """Geometric mean of the ratios of errors on the test set, compared model / null; 1 where there is none."""
-        return mean_ratio(self.errors)
-
-    @property
     def improves(self) -> bool:
         """Whether the compared model may be called better than the null."""
         if self.before is None or self.after is None:
@@ -87,9 +83,7 @@ class Judgement:
             return self
         if self.added and self.after is not None and not improves(compare(self.after, best.errors, self.seed)):
             return self
-        if self.refusal is not None and self.refusal.reason is Reason.FEW_RUNS:
-            return replace(self, law=best)
-        return replace(self, law=best, added=False, refusal=Refusal(Reason.LAW))
+        return self._giving_way(law=best)
 
     @property
     def of_all(self) -> judge.Judged | None:
@@ -100,11 +94,13 @@ class Judgement:
 
     def split(self, fleet: Kinds | None) -> Judgement:
         """Return the judgement beside laws for several kinds of drivers, which were better than ``of_all``."""
-        if fleet is None:
-            return self
+        return self if fleet is None else self._giving_way(fleet=fleet)
+
+    def _giving_way(self, **better: Any) -> Judgement:
+        """Return the judgement beside a better model; where runs are too few, that stays the reason."""
         if self.refusal is not None and self.refusal.reason is Reason.FEW_RUNS:
-            return replace(self, fleet=fleet)
-        return replace(self, fleet=fleet, added=False, refusal=Refusal(Reason.LAW))
+            return replace(self, **better)
+        return replace(self, **better, added=False, refusal=Refusal(Reason.LAW))
 
     def climbed(self, records: Records, pooled: judge.Judged | None, floor_m: float) -> Ladder:
         """Return the ladder, from the ``pooled`` null to what sensors alone leave 5 s ahead (m)."""
@@ -148,7 +144,7 @@ class Judgement:
     def names(self) -> dict[str, str]:
         """Return which model every file holds: the law alone, the model beside it, another law, those of kinds.
 
-        ``model.yaml`` is the one for all drivers that predicts best on the test set.
+        ``model.yaml`` is the one for all drivers that the verdict is about.
         """
         corrected = ["model_corrected.yaml"] if self.compared is not None else []
         files = (
@@ -156,7 +152,7 @@ class Judgement:
         )
         if self.law is not None:
             files = ["model_idm.yaml", *corrected, "model.yaml"]
-        elif self.beneath is None and self.compared is not None and self.mean_ratio < 1.0:
+        elif self.beneath is None and self.added:
             files = ["model_idm.yaml", "model.yaml"]
         titles = [*self.titles, *([self.law.title] if self.law is not None else [])]
         titles += [] if self.beneath is None else [self.beneath.titles[0]]

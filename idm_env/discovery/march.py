@@ -66,19 +66,24 @@ _SEEN: dict[Leaf, str] = {
 _BESIDE = {"distance": "signals[i, 11]", "speed": "signals[i, 12]", "present": "signals[i, 13]"}
 
 
+PINNED = 1.0001
+"""Upper bound over the lower one of a parameter that stays where it is."""
+
+
 @dataclass(frozen=True)
 class Catalogue:
     """A car-following law and candidates as the loop has them, and how θ, φ and the flags are laid out.
 
-    θ are the law's parameters, each driver's own, and the strengths of the effects ``personal``.
-    ``located`` says whether there is room for what has no name; a loop
-    without it compiles in a fraction of the time.
+    θ are the law's parameters, each driver's own, and the strengths of the effects ``personal``. Those of the law that
+    it is tried ``without`` stay at their low bounds. ``located`` says whether there is room for what has no name;
+    a loop without it compiles in a fraction of the time.
     """
 
     effects: tuple[Effect, ...]
     base: CarFollowing = BASE
     located: bool = True
     personal: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, effects: Sequence[Effect] = (), period: float = 0.0, base: CarFollowing = BASE) -> Catalogue:
@@ -94,8 +99,17 @@ class Catalogue:
     @cached_property
     def of_driver(self) -> tuple[tuple[str, Parameter], ...]:
         """Effect and declaration of every entry of θ."""
-        effects = (self.base, *(self.by_name[name] for name in self.personal))
-        return tuple((e.name, p) for e in effects for p in (e.declared if e is self.base else e.parameters))
+        pinned = {
+            p: replace(p, default=p.low, high=PINNED * p.low) for p in self.base.declared if p.name in self.without
+        }
+        law = ((self.base.name, pinned.get(p, p)) for p in self.base.declared)
+        return (*law, *((name, p) for name in self.personal for p in self.by_name[name].parameters))
+
+    def at_bounds(self, theta: np.ndarray) -> dict[str, int]:
+        """Return how many groups have each of the drivers' parameters at a bound, in any of their log θ [..., G, P]."""
+        low, high = self.bounds.T
+        count = ((theta < low + 1e-3) | (theta > high - 1e-3)).reshape(-1, *theta.shape[-2:]).any(0).sum(0)
+        return {p.name: int(n) for p, n in zip(self.own, count, strict=True) if p.name not in self.without}
 
     @cached_property
     def bounds(self) -> np.ndarray:

@@ -28,7 +28,6 @@ class Noise:
     first: np.ndarray
     later: np.ndarray
     weight: np.ndarray
-    log_det: float
 
     def whiten(self, errors: np.ndarray, joined: np.ndarray) -> np.ndarray:
         """Return whitened errors [..., R, m]: independent and of unit variance where nothing is missing."""
@@ -58,7 +57,7 @@ def first_noise(rows: Rows) -> Noise:
     """Return independent errors of 0.15 m/s and 0.3 m, to begin with."""
     size = rows.valid.shape[1] + 2
     white = np.diag(1.0 / np.append(np.full(size - 2, 0.15), [0.2, 0.4]))
-    return Noise(np.zeros((size, size)), white, white, np.ones(len(rows)), 0.0)
+    return Noise(np.zeros((size, size)), white, white, np.ones(len(rows)))
 
 
 def estimate(errors: np.ndarray, joined: np.ndarray, rounds: int = 3) -> Noise:
@@ -74,20 +73,18 @@ def estimate(errors: np.ndarray, joined: np.ndarray, rounds: int = 3) -> Noise:
         ridge = (SHRINK * np.trace(past) / size + 1e-12) * np.eye(size)
         carry = np.linalg.solve(past + ridge, (before * w[:, None]).T @ errors).T
         rest = errors - before @ carry.T
-        later, log_det = _whitener(rest[joined], weight[joined], errors, weight)
-        first, _ = _whitener(errors, weight, errors, weight)
+        later = _whitener(rest[joined], weight[joined], errors, weight)
+        first = _whitener(errors, weight, errors, weight)
         white = np.where(joined[:, None], rest @ later.T, errors @ first.T)
         size_of = np.sqrt((white**2).mean(1) / max(float(np.median((white**2).mean(1))), 1e-12))
         weight = np.minimum(1.0, HEAVY / np.maximum(size_of, 1e-9))
-    return Noise(carry, first, later, weight, log_det)
+    return Noise(carry, first, later, weight)
 
 
-def _whitener(
-    rest: np.ndarray, weight: np.ndarray, everything: np.ndarray, all_weight: np.ndarray
-) -> tuple[np.ndarray, float]:
+def _whitener(rest: np.ndarray, weight: np.ndarray, everything: np.ndarray, all_weight: np.ndarray) -> np.ndarray:
     if len(rest) < 3 * rest.shape[1]:
         rest, weight = everything, all_weight
     covariance = (rest * weight[:, None]).T @ rest / weight.sum()
     diagonal = np.diag(np.diag(covariance)) + 1e-10 * np.eye(len(covariance))
     factor = np.linalg.cholesky((1.0 - SHRINK) * covariance + SHRINK * diagonal)
-    return solve_triangular(factor, np.eye(len(factor)), lower=True), 2.0 * float(np.log(np.diag(factor)).sum())
+    return np.asarray(solve_triangular(factor, np.eye(len(factor)), lower=True))

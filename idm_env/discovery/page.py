@@ -103,6 +103,13 @@ def _in_units(r: Result, key: str) -> str:
     return f"{number(r.error.before[key])} → {number(getattr(base, key))} {words.ERRORS[key][1]}, "
 
 
+def _later(r: Result) -> list[tuple[str, str, str]]:
+    """Return a card of predictions 10 s ahead, where what was chosen makes them worse: it was not chosen by them."""
+    rungs = [] if r.ladder is None else list(r.ladder.ten_s_m.values())
+    ratio = rungs[2] / rungs[1] if len(rungs) > 2 else 1.0
+    return [("Gap 10 s ahead", "worse", change(ratio))] if ratio > 1.0 else []
+
+
 def cards(r: Result, law: str) -> list[tuple[str, str, str]]:
     """Return the first screen's cards: how each error changed or, where nothing is compared, what is known instead."""
     if (better := _better(r)) is not None:
@@ -113,9 +120,9 @@ def cards(r: Result, law: str) -> list[tuple[str, str, str]]:
                 f"{_in_units(r, key)}{change(a.ratio)} ({changes(a, ' to ')})",
             )
             for key, a in better.items()
-        ]
+        ] + _later(r)
     if r.helps:
-        return [
+        return _later(r) + [
             (
                 words.ERRORS[key][0].capitalize(), h.verdict,
                 f"{number(h.before)} → {number(h.after)} {h.unit}, {change(h.ratio)}"

@@ -237,14 +237,17 @@ class Against:
 class LawErrors:
     """A law alone: its errors, and how they compare with the null's; ``own`` are effects of each driver's strength.
 
-    ``parameters`` is how many each driver has of his own.
+    ``parameters`` is how many each driver has of his own. ``at_bounds`` is how many drivers have one of them at a
+    bound, and ``without`` are the parts of the law that it was tried without.
     """
 
     base: str
     title: str
     equation: str
     own: list[str]
+    without: list[str]
     parameters: int
+    at_bounds: dict[str, int]
     fitted_to_what_is_judged: bool
     gap_rmse_m: float
     horizon_rmse_m: float

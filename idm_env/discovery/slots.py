@@ -45,10 +45,15 @@ def _chosen(values: dict[str, Tensor], p: P) -> Tensor:
     return x  # type: ignore[no-any-return]
 
 
+@dataclass(frozen=True)
 class _OverAny(OverFeature):
-    """Part of an effect that stands over any feature of the scene, or of the ``past``."""
+    """Part of an effect that stands over any feature of the scene, or of the ``past``, or is an input (``given``)."""
 
-    past: bool
+    label: str = ""
+    given: bool = False
+    past: bool = False
+    knots: tuple[float, ...] = (0.0, 1.0)
+    values: tuple[float, ...] = (0.0, 0.0)
 
     @property
     def remembers(self) -> bool:
@@ -90,12 +95,7 @@ class Slot(_OverAny, Effect):  # type: ignore[misc, override]
 
     kind: ClassVar[str] = "slot"
     rank: ClassVar[int] = DriverCurve.rank
-    label: str = ""
     targets: tuple[str, ...] = SETS[0]
-    given: bool = False
-    past: bool = False
-    knots: tuple[float, ...] = (0.0, 1.0)
-    values: tuple[float, ...] = (0.0, 0.0)
 
     @property
     def name(self) -> str:
@@ -120,11 +120,6 @@ class Push(_OverAny, Effect):  # type: ignore[misc, override]
 
     kind: ClassVar[str] = "push"
     declared: ClassVar[tuple[Parameter, ...]] = (OVER, BY)
-    label: str = ""
-    given: bool = False
-    past: bool = False
-    knots: tuple[float, ...] = (0.0, 1.0)
-    values: tuple[float, ...] = (0.0, 0.0)
 
     @property
     def name(self) -> str:

@@ -79,7 +79,7 @@ def summarise(
             *words.details(verdict, added, nearest, 1.0 - float(np.exp(-first.smooth_gain))),
             *([words.beyond(judged.titles[-1], judged.beneath.titles[0], beyond)] if judged.beneath else []),
             *words.agreement(judged.ladder, first.leading),
-            *words.cautions(data.at_bounds, data.drivers),
+            *words.cautions(data.at_bounds if judged.law is None else judged.law.at_bounds, data.drivers),
         ],
         found=added,
         known=_known(final, interval_of(final, problem), base),
@@ -402,16 +402,8 @@ def _data(
         share_free=float((free & ~standing).mean()),
         share_approaching=float((~free & (closing > 1.0) & ~standing).mean()),
         share_following=float((~free & (closing <= 1.0) & ~standing).mean()),
-        at_bounds=at_bounds(null),
+        at_bounds=null.model.catalogue.at_bounds(null.theta),
         unexplained_gain=[float(r.left.mean()) for r in rounds],
         horizon_s=rows.steps * prepared.dt,
         lap_m=prepared.period or None,
     )
-
-
-def at_bounds(solution: Solution) -> dict[str, int]:
-    """Return how many groups have each of the drivers' parameters at a bound."""
-    out, catalogue = {}, solution.model.catalogue
-    for i, (p, (low, high)) in enumerate(zip(catalogue.own, catalogue.bounds, strict=True)):
-        out[p.name] = int(((solution.theta[:, i] < low + 1e-3) | (solution.theta[:, i] > high - 1e-3)).sum())
-    return out

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from idm_env.discovery.bases import Law
+from idm_env.discovery.bases import LEAST, Law
 from idm_env.discovery.compare import Comparison, ErrorChange
 from idm_env.discovery.fleet import Kinds
 from idm_env.discovery.ladder import Ladder
@@ -77,7 +77,10 @@ def told(p: Parameter, estimate: float, low: float, high: float) -> str:
     unit = "" if p.unit == "1" else f" {p.unit}"
     if p.role == "place":
         return f"{p.symbol or p.name} = {estimate:,.0f}{unit}".replace(",", " ")
-    return f"{p.symbol or p.name} = {number(estimate)}{unit} [{number(low)}, {number(high)}]"
+    # An interval is cut at the bounds of the search, beyond which nothing was tried.
+    ends = [number(x) for x, at_bound in ((low, low <= p.low), (high, high >= p.high)) if at_bound]
+    bound = f"; {' and '.join(ends)} the search's bound" if ends else ""
+    return f"{p.symbol or p.name} = {number(estimate)}{unit} [{number(low)}, {number(high)}{bound}]"
 
 
 def clause(term: Term, values: Sequence[Sequence[float]], contrast: Contrast | None = None, law: str = "IDM") -> str:
@@ -269,6 +272,9 @@ def _but(errors: Mapping[str, Comparison]) -> str:
         return f"; on the test set the error of the {' and the '.join(worse)} is larger with it"
     if errors and not any(c.outcome is ErrorChange.BETTER for c in errors.values()):
         return "; no error on the test set is significantly lower with it"
+    gap = errors.get("gap_rmse_m")
+    if gap is not None and gap.driver[0] > 1.0 + LEAST:
+        return f"; of the mean follower the gap in free simulation errs {percent(gap.driver[0])}"
     return ""
 
 

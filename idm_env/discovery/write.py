@@ -17,7 +17,7 @@ from idm_env.reports.undecided import EXPLAINED, FOUND, SEARCH
 def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
     """Write report.json, report.html (self-contained) and models into a folder; return their paths by file name.
 
-    ``model.yaml`` predicts best of the models compared; where two were, the other lies beside it as
+    ``model.yaml`` is the model that the verdict is about; where two were compared, the other lies beside it as
     ``model_idm.yaml`` or ``model_corrected.yaml``, and laws of kinds of drivers as ``model_group_1.yaml`` and so
     on. A finding in a state that has no name is ``found_effect.py``, too.
     """

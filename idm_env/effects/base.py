@@ -239,7 +239,12 @@ class Effect:
 
 @dataclass(frozen=True)
 class CarFollowing(Effect):
-    """An effect that wants an acceleration *and* owns the driver's parameters; a simulator has exactly one."""
+    """An effect that wants an acceleration *and* owns the driver's parameters; a simulator has exactly one.
+
+    At the low bounds of its ``spared`` parameters a part of it is absent, and the rest is a law.
+    """
+
+    spared: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()

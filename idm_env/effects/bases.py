@@ -200,6 +200,7 @@ class ConstantTimeGap(OfFiveParameters):
         Parameter("min_gap", "s0", "m", 4.0, 0.1, 15.0, role="shape"),
         Parameter("desired_speed", "v0", "m/s", 33.0, 1.0, 70.0, role="shape"),
     )
+    spared = ("feed_forward", "lag")
     cruise_gain: float = 0.4
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:

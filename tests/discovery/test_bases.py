@@ -122,7 +122,9 @@ def test_linear_controllers_have_their_law_and_what_it_lacks(effect: str | None,
     data = synthetic.generate(33, runs=8, followers=2, seconds=90.0, effect=effect)[0]
     found = discover(data, effects=["speed_time_gap"])
     first = found.report["sentence"].split("(what it lacks follows)" if effect else "(no effect added to it holds: ")
-    assert len(first) == 2 and first[0].startswith("Linear constant time gap predicts better than IDM")
+    assert len(first) == 2 and re.match(
+        r"Linear constant time gap( without (feed forward|lag))? predicts better than IDM", first[0]
+    )
     laws = [next(iter(model.effects)).name for model in found.models.values()]
     if effect:
         assert found.report["found"][0]["effect"] == effect and laws == [
@@ -132,8 +134,13 @@ def test_linear_controllers_have_their_law_and_what_it_lacks(effect: str | None,
         ]
         assert found.report["completed"]["against"]["gap_rmse_m"]["high"] < 0.5
         assert_a_model_has_one_figure(found.report)
+        ablated = {row["title"]: row for row in found.report["bases"] if row["without"]}
+        assert set(ablated) == {f"linear constant time gap without {part}" for part in ("feed forward", "lag")}
+        assert {row["parameters"] for row in ablated.values()} == {8}, "a part that is left out is no parameter"
     else:
         assert found.report["reason"] == "law" and found.report["completed"] is None
+        best = next(row for row in found.report["bases"] if row["title"] == found.report["models"]["model.yaml"])
+        assert best["without"] and best["parameters"] == 8, "what the drivers lack is no part of the law"
         assert found.model.effects[0].name == "constant_time_gap"
         assert page.cards(found.result, "IDM")[0][1] == "better", "the first screen is of the law"
 

@@ -289,6 +289,12 @@ def test_bounds_are_told() -> None:
     assert "comfort decel is at its bound for 15 of 38" in told
 
 
+def test_an_interval_that_ends_at_the_bound_of_the_search_says_so() -> None:
+    parameter = replace(terms.simple("gap_stiffness").parameters[0], low=0.05, high=3.0)
+    assert words.told(parameter, 0.2, 0.05, 0.4).endswith("[0.05, 0.4; 0.05 the search's bound]")
+    assert words.told(parameter, 0.2, 0.06, 0.4).endswith("[0.06, 0.4]")
+
+
 def test_words_of_none_claim_no_cause() -> None:
     text = words.headline(Verdict.NONE, [], Refusal(Reason.NO_GAIN), "", {})
     assert "drivers' own noise" not in text + " ".join(words.details(Verdict.NONE, [], [], 0.01))
