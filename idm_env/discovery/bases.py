@@ -15,14 +15,11 @@ from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.result import Against, LawErrors
-from idm_env.discovery.verdict import HOLDS, improves, mean_ratio
+from idm_env.discovery.verdict import improves, mean_ratio
 from idm_env.effects import ALL, BASES, CarFollowing, base_named, make
 
 LEAST = 0.03
 """Least fall of the geometric mean of the errors for which a law is named first: it is chosen among several."""
-
-SCREENED = ("gap_rmse_m", "horizon_rmse_m")
-"""Errors that tell by themselves which laws are far from the null."""
 
 
 class Law(NamedTuple):
@@ -32,8 +29,6 @@ class Law(NamedTuple):
     model: Hypothesis
     errors: Judged
     against: dict[str, Comparison]
-    at_best: bool = False
-    """Whether it and the null have errors of the very data that they are fitted to, which speak against it already."""
 
     @property
     def own(self) -> tuple[str, ...]:
@@ -70,7 +65,7 @@ class Law(NamedTuple):
         """
         if self.own and self.against["horizon_rmse_m"].outcome is not ErrorChange.BETTER:
             return False
-        return not self.at_best and improves(self.against) and self.mean_ratio < 1.0 - LEAST
+        return improves(self.against) and self.mean_ratio < 1.0 - LEAST
 
     @property
     def mean_ratio(self) -> float:
@@ -79,7 +74,7 @@ class Law(NamedTuple):
 
 
 def compared(
-    null: Hypothesis, first: Judged, judged: Callable[[Hypothesis], tuple[Judged, Judged]], seed: int,
+    null: Hypothesis, first: Judged, judged: Callable[[Hypothesis], Judged], seed: int,
     on_law: Callable[[int, int, str], None],
 ) -> list[Law]:  # fmt: skip
     """Return all laws, that of the null first.
@@ -87,8 +82,7 @@ def compared(
     Args:
         null: The law that is completed, with what is known beside it.
         first: Its errors.
-        judged: Calibrates and judges a model; also returns the null's errors that these are to be compared with:
-            ``first``, or where a law ``is_far`` those of the very data that both are fitted to.
+        judged: Calibrates and judges a model, as the null was.
         seed: Of the bootstrap.
         on_law: Called before each with its number, how many there are, and its title.
     """
@@ -99,8 +93,8 @@ def compared(
     def add(model: Hypothesis) -> None:
         law = model.catalogue.base
         on_law(len(laws), len(laws) + 1, law.title)
-        errors, of_null = judged(model)
-        laws.append(Law(law, model, errors, compare(of_null, errors, seed), of_null is not first))
+        errors = judged(model)
+        laws.append(Law(law, model, errors, compare(first, errors, seed)))
 
     for law in others:
         add(Hypothesis(null.terms, Catalogue(named, law, located=False)))
@@ -116,15 +110,6 @@ def compared(
             if law.declared == own.declared:
                 add(personal(null, law))
     return laws
-
-
-def is_far(law: Judged, null: Judged) -> bool:
-    """Tell whether a law is so far from better than the null that it needs no cross-fitting.
-
-    Each is fitted to the very data that are judged, and errs by more than ``HOLDS`` more in all of ``SCREENED``.
-    """
-    errors, others = law.summary(), null.summary()
-    return all(errors[key] > HOLDS * others[key] for key in SCREENED)
 
 
 def personal(null: Hypothesis, law: CarFollowing) -> Hypothesis:
@@ -146,15 +131,13 @@ def rows(laws: Iterable[Law]) -> list[LawErrors]:
     return [
         LawErrors(
             each.law.kind, each.title, each.law.equation, list(each.own), list(each.model.catalogue.without),
-            each.parameters, {name: n for name, n in each.at_bounds.items() if n}, each.at_best,
-            **each.errors.summary(), against=against_rows(each.against, not each.at_best),
+            each.parameters, {name: n for name, n in each.at_bounds.items() if n},
+            **each.errors.summary(), against=against_rows(each.against),
         )
         for each in laws
     ]  # fmt: skip
 
 
-def against_rows(against: Mapping[str, Comparison], judged: bool = True) -> dict[str, Against]:
-    """Return what a report says of how errors compare, of laws that were not ``judged`` without an outcome."""
-    return {
-        key: Against(c.outcome.value if judged else "not judged", c.ratio, c.low, c.high) for key, c in against.items()
-    }
+def against_rows(against: Mapping[str, Comparison]) -> dict[str, Against]:
+    """Return a report's row of how errors compare."""
+    return {key: Against(c.outcome.value, c.ratio, c.low, c.high) for key, c in against.items()}

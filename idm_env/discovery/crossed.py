@@ -137,19 +137,6 @@ def in_blocks(records: Records) -> Rows | None:
     return rows.some(inside) if inside.any() else None
 
 
-def at_best(
-    records: Records, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None
-) -> tuple[judge.Judged, np.ndarray]:
-    """Return a model's errors on the very data that it is fitted to, and log θ [G, P]; values [Q].
-
-    A model whose errors are far above another's even so needs no cross-fitting. ``start`` is as in ``crossed``.
-    """
-    theta = judge.unweighed(
-        records, model, values, first_prior(model.catalogue.own), start=start, calibrated=start is not None
-    )[1]
-    return judge.judge(records, model, values, theta), theta
-
-
 def _weighed(mine: list[Rows], prior: Population, frozen: Hypothesis, near: np.ndarray) -> _Fold:
     """Fit the drivers of a fold to each half of their time with every weight of the population."""
     thetas: dict[float, np.ndarray] = {}

@@ -100,7 +100,7 @@ def finished(
     before, of_laws = evaluation.of_null[1], evaluation
     laws: list[bases.Law] = []
     if before is not None:
-        laws = bases.compared(decided.null.model, before, evaluation.against_null, evaluation.seed, on_law)
+        laws = bases.compared(decided.null.model, before, evaluation.of_law, evaluation.seed, on_law)
     least = judge.least_m(evaluation.records)
     if judgement.is_exact(least):
         judgement = replace(judgement, added=False, refusal=judgement.refusal or Refusal(Reason.SMALL_SIZE, least))

@@ -10,21 +10,19 @@ from itertools import combinations
 import numpy as np
 
 from idm_env.discovery import judge, result
-from idm_env.discovery.bases import LEAST, SCREENED, Law, against_rows
+from idm_env.discovery.bases import LEAST, Law, against_rows
 from idm_env.discovery.compare import ERRORS, Comparison, compare
 from idm_env.discovery.crossed import in_blocks
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import windows
-from idm_env.discovery.verdict import HOLDS, improves, mean_ratio
+from idm_env.discovery.verdict import improves, mean_ratio
 
 COLUMNS = ("vehicle_class", "acc_run", "driver", "kind")
 """Columns that may say of what kind a driver is, in the order in which they are asked."""
 Among = Callable[[Hypothesis, np.ndarray], Judged]
 FEWEST, SHARE = 3, 0.15
 """Least number of drivers of a kind, and least share of all."""
-CLEARLY = 0.85
-"""Ratio of a driver's errors under two laws, each fitted to the very data, that speaks for a kind of his own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,28 +66,11 @@ def by_columns(judged: Judged) -> dict[str, np.ndarray]:
     return {name: np.array(kind) for name, kind in columns.items() if None not in kind and len(set(kind)) > 1}
 
 
-def is_worth(law: Judged, null: Judged) -> bool:
-    """Tell whether a law that is worse for all drivers together may be that of some of them.
-
-    Each is fitted to the very data that are judged. As in ``bases.is_far``, but for the drivers of one kind; or
-    enough drivers err less by ``CLEARLY``.
-    """
-    (of_law, of_null) = ([j.squares[key][0] for key in SCREENED] for j in (law, null))
-    for kind in by_columns(null).values():
-        for mine in (kind == name for name in np.unique(kind)):
-            near = (a[mine].sum() <= HOLDS**2 * b[mine].sum() for a, b in zip(of_law, of_null, strict=True))
-            if mine.sum() >= FEWEST and any(near):
-                return True
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.exp(0.5 * np.mean([np.log(a / b) for a, b in zip(of_law, of_null, strict=True)], axis=0))
-    return int((ratio < CLEARLY).sum()) >= max(FEWEST, SHARE * len(ratio))
-
-
 def found(laws: Iterable[Law], one: Judged, among: Among, seed: int) -> Kinds | None:
     """Return the fleet that is better than ``one`` model for all drivers, or None: by a column first, then by errors.
 
-    Every kind is a population of its own, with its law as with the null: laws are compared, and not populations. Laws
-    count that were judged where they were not calibrated, without strengths of drivers' own.
+    Every kind is a population of its own, with its law as with the null: laws are compared, and not populations. Whole
+    laws count, without strengths of drivers' own.
 
     Args:
         laws: All laws, that of the null first.
@@ -97,7 +78,7 @@ def found(laws: Iterable[Law], one: Judged, among: Among, seed: int) -> Kinds | 
         among: Judges a model for the drivers of some records [records].
         seed: Of the bootstrap.
     """
-    fair = [law for law in laws if not (law.at_best or law.own or law.model.catalogue.without)]
+    fair = [law for law in laws if not (law.own or law.model.catalogue.without)]
     if len(fair) < 2:
         return None
     logs = np.stack([_logs(law.errors) for law in fair])

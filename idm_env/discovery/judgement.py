@@ -10,7 +10,7 @@ import numpy as np
 
 from idm_env.discovery import bases, calibrate, closed_loop, crossed, judge, ladder as ladders, words
 from idm_env.discovery.compare import Comparison, compare
-from idm_env.discovery.fleet import Kinds, is_worth
+from idm_env.discovery.fleet import Kinds
 from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records
@@ -191,10 +191,6 @@ class Evaluation:
             return self.judged(self.null)
         return self.calibrated(self.null.model, self.null.values, self.null.theta)[0], self.known
 
-    @cached_property
-    def _null_at_best(self) -> judge.Judged:
-        return crossed.at_best(self.records, self.null.model, self.null.values, self.of_null[0].theta)[0]
-
     def calibrated(self, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None) -> Calibration:
         """Return a model with values [Q], calibrated from log θ [G, P]; errors only where drivers do not adapt."""
         fit = self.searching.calibrated(model, values, start)
@@ -212,25 +208,14 @@ class Evaluation:
             errors = crossed.crossed(self.records, s.model, values, self._fold, theta.theta, pooled)
         return theta, errors
 
-    def against_null(self, model: Hypothesis) -> tuple[judge.Judged, judge.Judged]:
-        """Return the errors of another law, and those of the null that they are compared with (see ``bases``).
-
-        One with strengths of the drivers' own is always cross-fitted: of the very data it says nothing.
-        """
-        before = self.of_null[1]
-        assert before is not None
-        if not self.adapt:
-            errors = self.calibrated(model, self.null.values)[1]
-            assert errors is not None
-            return errors, before
-        theta = None
-        if not model.catalogue.personal:
-            of_null = self._null_at_best
-            at_best, theta = crossed.at_best(self.records, model, self.null.values)
-            if bases.is_far(at_best, of_null) and not is_worth(at_best, of_null):
-                return at_best, of_null
-        values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
-        return crossed.crossed(self.records, model, values, self._fold, theta), before
+    def of_law(self, model: Hypothesis) -> judge.Judged:
+        """Return the errors of another law, calibrated and judged as the null."""
+        if self.adapt:
+            values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
+            return crossed.crossed(self.records, model, values, self._fold)
+        errors = self.calibrated(model, self.null.values)[1]
+        assert errors is not None
+        return errors
 
     def among(self, model: Hypothesis, wanted: np.ndarray) -> judge.Judged:
         """Return the errors of a law for the drivers of the records ``wanted`` [records], its population."""

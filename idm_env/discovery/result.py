@@ -248,7 +248,6 @@ class LawErrors:
     without: list[str]
     parameters: int
     at_bounds: dict[str, int]
-    fitted_to_what_is_judged: bool
     gap_rmse_m: float
     horizon_rmse_m: float
     speed_rmse_mps: float

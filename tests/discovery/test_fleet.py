@@ -82,14 +82,6 @@ def test_kinds_are_told_where_there_are_some_and_hardly_ever_elsewhere(
         assert told.agreed == len(told.group) and told.against["gap_rmse_m"].ratio == pytest.approx(0.63, abs=0.05)
 
 
-def test_a_law_that_is_far_for_all_together_may_be_that_of_some(platoon: Records) -> None:
-    """Of three drivers, and not of two."""
-    of_null = judged(platoon, np.ones(len(platoon)), 0)
-    for few, worth in ((2, False), (3, True)):
-        scale = np.where(np.arange(len(platoon)) < few, 0.3, 3.0)
-        assert fleet.is_worth(judged(platoon, scale, 1), of_null) is worth
-
-
 @pytest.mark.parametrize("column", ["acc_run", ""])
 def test_a_mixed_file_has_a_law_for_each_kind_of_driver(column: str, kinds: Mixing, tmp_path: Path) -> None:
     """Every second driver is a linear controller; what each kind follows is said first, and each has a model."""
