@@ -6,7 +6,7 @@ Shapes: a window has time first: ``[steps, rows, …]``.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial, reduce
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -32,6 +32,10 @@ if TYPE_CHECKING:
 
 _FEW, _MANY, _MOST = 3, 1009, 8
 """Rows of a policy's recording to compare, to print (no other dimension), and how many prints of one are kept."""
+
+
+_PARTS = 8
+"""Parts of a large window, each with its own sum of the weights' gradients: bits do not depend on threads."""
 
 
 class Driver:
@@ -204,7 +208,9 @@ class Tape:
         self.ends, self.cuts = (self.outputs[f"whole_{n}"].reshape(steps, rows) for n in ("terminated", "truncated"))
         self.segments: list[_Segment] = []
         self._blocks = -(-rows // BLOCK)
-        self._threads = 1 if plan.count * AHEAD < 2 * pool.GRAIN else pool.count(plan.count * AHEAD)
+        some = plan.count * AHEAD >= 2 * pool.GRAIN
+        self._threads = pool.count(plan.count * AHEAD) if some else 1
+        self._parts = min(self._blocks, _PARTS) if some else 1
 
     def run(self, batch: Batch, values: Values, weights: Mapping[str, Array]) -> None:
         """Do all steps; episodes that end begin anew with the next action."""
@@ -323,8 +329,7 @@ class Tape:
             on_last.reshape(steps, plan.rows, -1)[self.tells, rows] = on_final.reshape(self.actions, plan.rows, -1)
         on_reward = (on_reward[:, None] * self.counts).reshape(steps, -1)
         total, recalled, on_later = on_seen[-1].copy(), on_hidden.copy(), np.empty_like(on_hidden)
-        threads = min(self._threads, self._blocks)
-        sums = [{n: np.zeros(size, plan.real) for n, size in driver.backward.sums.items()} for _ in range(threads)]
+        sums = [{n: np.zeros(k, plan.real) for n, k in driver.backward.sums.items()} for _ in range(self._parts)]
         remembers = "to_hidden" in driver.backward.outs
         for first, last, moment, before, pointers in reversed(self.segments):
             recorded, numbers = moment.bound.recorded, np.arange(first, last)
@@ -348,20 +353,23 @@ class Tape:
                 first, last - first, self.over[first:last], two, mid, pasts, on_seen, on_last[first:last], on_action,
                 acted, done, on_observation, looked, total, recalled, on_later, remembers, each, parameters,
             )  # fmt: skip
-            some = partial(_rows_back, driver.backward, list(sums), see, shared, arrays)
-            pool.split(some, self._blocks, 1, threads)
+            some = partial(_parts_back, driver.backward, sums, see, (shared, arrays, self._blocks))
+            pool.split(some, self._parts, 1, self._threads)
             if len(mid):
                 two[first % 2] = plan.first(moment, (two[first % 2], *mid), parameters)
         summed = {n: sum((x[n] for x in sums[1:]), sums[0][n]) for n in sums[0]}
         return two[0], pasts[0], parameters, acted, {**summed, "seen": total, "hidden": recalled}
 
 
-def _rows_back(
-    loops: PolicyRows, free: list[Any], see: Mapping[str, Any], shared: Any, arrays: Any, *span: int
-) -> None:
-    """Go back over a span of blocks with sums that no other thread has taken."""
-    own = {n: address(x) for n, x in free.pop().items()}
-    window_back(loops.call, _columns(loops, {**see, **own}, arrays[1]), *shared, *span, *arrays)
+def _parts_back(loops: PolicyRows, sums: Sequence[Any], see: Mapping[str, Any], laid: Any, *span: int) -> None:
+    """Go back over a span of parts of the blocks, each with sums of its own."""
+    shared, arrays, blocks = laid
+    acts = _columns(loops, {**see, **dict.fromkeys(sums[0], 0)}, arrays[1])
+    for part in range(*span):
+        for name, x in sums[part].items():
+            acts[:, loops.place(name)] = address(x)
+        begin, end = (blocks * k // len(sums) for k in (part, part + 1))
+        window_back(loops.call, acts, *shared, begin, end, *arrays)
 
 
 class _Window(torch.autograd.Function):

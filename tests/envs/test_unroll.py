@@ -153,6 +153,22 @@ class Counting(nn.Module):
         return hidden - 0.25, hidden
 
 
+def test_a_large_window_has_the_same_bits_on_any_number_of_threads():
+    """Values, and gradients of weights, which are sums over rows."""
+    env = DiffIDMVectorEnv(480, task="ring", warmup=0, output="torch", failsafe=3.0)
+    policy, threads, results = network("all", env), torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            env.reset(seed=1)
+            out = env.unroll(policy, 5)
+            gradients = torch.autograd.grad(out.reward.sum(), list(policy.parameters()))
+            results.append([out.observation.detach(), *gradients])
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(x, y) for other in results[1:] for x, y in zip(results[0], other, strict=True))
+
+
 def test_what_a_policy_remembers_begins_anew_with_an_episode():
     """As in a loop of one's own, to the last bit; the next window is given what this one remembers."""
     window, loop = (made(*CASES[0][:2], "float32") for _ in range(2))
