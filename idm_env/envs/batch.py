@@ -73,7 +73,7 @@ class Outcome(NamedTuple):
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Outcome:
         """Return what ``Batch.told`` tells, sorted."""
-        rest = {name: told[key] for name, key in _DETAILS if key in told}
+        rest = {name: told[key] for name, key in _details_in(tuple(told))}
         whole = Whole(told["whole_reward"], told["whole_terminated"], told["whole_truncated"])
         return cls(told["observation"], told["reward"], told["terminated"], told["truncated"], whole, rest)
 
@@ -108,7 +108,10 @@ def _summed(rows: Mapping[str, np.ndarray], steps: int) -> dict[str, np.ndarray]
     return {n: x[steps - 1].copy() for n, x in rows.items()} | {n: sum(x[1:], x[0].copy()) for n, x in paid.items()}
 
 
-_DETAILS = tuple((name, f"info_{name}") for name in INFO)
+@functools.lru_cache(32)
+def _details_in(names: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
+    """Return the names of infos that are among those of outputs, each with the output's."""
+    return tuple((name, f"info_{name}") for name in INFO if f"info_{name}" in names)
 
 
 def in_memory(act: Act) -> Act:

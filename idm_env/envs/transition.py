@@ -295,7 +295,7 @@ class CompiledTransition:
         moment.begins = self.begins(moment, now, later.data_ptr(), tape)
         self.split(bound.recorded.forward, bound.once.pointer(moment.given, moment.begins))
         self.refuse_nan(later)
-        return bound.room.copied()
+        return {n: x.copy() for n, x in bound.room.arrays.items()}
 
     def refuse_nan(self, worlds: Tensor) -> None:
         """Raise Untraceable where an effect of the user's own returned NaN: blocks ``[…, blocks, rows, vehicles]``."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from ctypes import addressof, c_char
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -107,20 +108,11 @@ class Room:
             begin = self._sizes.get(kind, 0)
             self._at.append((name, kind, begin * kind.itemsize, shape))
             self._sizes[kind] = begin + math.prod(shape)
-        self._memory: dict[Any, Array] = {}
 
     @cached_property
     def arrays(self) -> dict[str, Array]:
         """Arrays that are filled again and again, by name."""
-        self._memory = {kind: np.empty(size, kind) for kind, size in self._sizes.items()}
-        return self._within(self._memory)
-
-    def _within(self, memory: Mapping[Any, Array]) -> dict[str, Array]:
-        return {name: np.ndarray(shape, kind, memory[kind], begin) for name, kind, begin, shape in self._at}
-
-    def copied(self) -> dict[str, Array]:
-        """Return copies of the arrays, by name."""
-        return self._within({kind: x.copy() for kind, x in self._memory.items()})
+        return {n: x[0] for n, x in self.take(1).items()}
 
     def take(self, steps: int) -> dict[str, Array]:
         """Return fresh arrays by name, with ``steps`` as their first dimension."""
@@ -163,5 +155,8 @@ def row_addresses(x: Array, numbers: Array) -> Array:
 
 def address(x: Array | None) -> int:
     """Return where an array begins."""
-    assert x is not None
-    return x.__array_interface__["data"][0]  # type: ignore[no-any-return]
+    try:
+        return addressof(c_char.from_buffer(x))  # type: ignore[arg-type]
+    except (TypeError, ValueError):  # it may not be written to, or is empty
+        assert x is not None
+        return x.__array_interface__["data"][0]  # type: ignore[no-any-return]
