@@ -105,3 +105,10 @@ def covers(drawn: np.ndarray, truth: np.ndarray, share: float) -> tuple[np.ndarr
     """Return whether the central band of ``share`` of the draws holds the truth, and the band's width."""
     low, high = np.quantile(drawn, [0.5 - 0.5 * share, 0.5 + 0.5 * share], axis=0)
     return (truth >= low) & (truth <= high), high - low
+
+
+def widening(drawn: np.ndarray, truth: np.ndarray, share: float) -> float:
+    """Return the factor by which central bands of draws [n, …] hold ``share`` of truths […], widened from medians."""
+    low, middle, high = np.quantile(drawn, [0.5 - 0.5 * share, 0.5, 0.5 + 0.5 * share], axis=0)
+    half = np.where(truth < middle, middle - low, high - middle)
+    return float(np.quantile(np.abs(truth - middle) / np.maximum(half, 1e-9), share))

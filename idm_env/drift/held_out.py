@@ -23,6 +23,8 @@ EVERY_S, FIRST_S = 5.0, 10.0
 DRAWS = 100
 MOST = 20
 """Drivers at most who are kept back."""
+NARROW = 85.0
+"""Percent of the truths below which a band of 90 % is too narrow."""
 LEAST = 8
 """Drivers below which none is kept back."""
 
@@ -46,7 +48,8 @@ def scores(
     A driver's own parameters and his drift are known from his past alone, about the median of the drivers of the
     estimate. He is followed on what was measured; a forecast begins every 5 s behind the recorded leader. A row has
     ``model``, ``ahead_s``, ``forecasts``, ``gap_rmse_m`` of the mean, ``gap_crps_m`` (Gneiting, Raftery 2007) and how
-    many percent of true gaps the central 50 and 90 % of the draws hold.
+    many percent of true gaps the central 50 and 90 % of the draws hold. ``widening`` is the factor by which the latter
+    would hold 90 %.
     """
     batch, raw = (Batch.stack(x, substeps=1) for x in (smooth, measured))
     dt, longest = smooth[0].dt, HORIZONS_S[-1]
@@ -70,6 +73,7 @@ def scores(
                 "gap_crps_m": float(forecast.crps(draws, truth).mean()),
                 "in_50_percent": 100.0 * float(forecast.covers(draws, truth, 0.5)[0].mean()),
                 "in_90_percent": 100.0 * float(forecast.covers(draws, truth, 0.9)[0].mean()),
+                "widening": forecast.widening(draws, truth, 0.9),
             })  # fmt: skip
     return rows
 
@@ -81,8 +85,11 @@ def sentence(rows: Sequence[Mapping[str, Any]], name: str | None, drivers: int) 
         return "", ""
     least = min(last.values(), key=lambda row: row["gap_crps_m"])
     shown = [least, *(last[n] for n in dict.fromkeys((name, "no drift")) if n and n != least["model"])]
+    band = f"the 90 % band of the first holds {least['in_90_percent']:.0f} %"
+    if least["in_90_percent"] < NARROW:
+        band += f", which is too narrow: {least['widening']:.2f} times as wide it holds 90 %"
     scores = ", ".join(f"{row['gap_crps_m']:.2f} m with {row['model']}" for row in shown)
     return least["model"], (
         f"{least['model'].capitalize()} forecasts best: on {drivers} drivers kept back the CRPS of the gap "
-        f"{HORIZONS_S[-1]:.0f} s ahead is {scores}; the 90 % band of the first holds {least['in_90_percent']:.0f} %."
+        f"{HORIZONS_S[-1]:.0f} s ahead is {scores}; {band}."
     )

@@ -152,7 +152,8 @@ def _sorts(answer: Told) -> list[dict[str, Any]]:
 def tables(report: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """Return the rows of a report under their names in words and units, by the title of their table."""
     names = {"ahead_s": "ahead (s)", "gap_rmse_m": "RMSE (m)", "gap_crps_m": "CRPS (m)", "tau_s": "tau (s)"}
-    names |= {"in_90_percent": "in the 90 % band (%)", "sort": "variant", "log_likelihood": "gain in log-likelihood"}
+    names |= {"in_90_percent": "in the 90 % band (%)", "widening": "widening to hold 90 %"}
+    names |= {"sort": "variant", "log_likelihood": "gain in log-likelihood"}
     both = {
         f"Forecasts of the gap of {report['kept_back']['drivers']} drivers kept back": report["kept_back"]["scores"],
         "Stochastic variants against the deterministic model": report["sorts"],

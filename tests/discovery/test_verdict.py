@@ -19,6 +19,7 @@ from idm_env.discovery import (
     discover,
     judge,
     model as terms,
+    page,
     page as pages,
     together,
     verdict,
@@ -292,6 +293,15 @@ def test_an_interval_that_ends_at_the_bound_of_the_search_says_so() -> None:
     parameter = replace(terms.simple("gap_stiffness").parameters[0], low=0.05, high=3.0)
     assert words.told(parameter, 0.2, 0.05, 0.4).endswith("[0.05, 0.4; 0.05 the search's bound]")
     assert words.told(parameter, 0.2, 0.06, 0.4).endswith("[0.06, 0.4]")
+
+
+@pytest.mark.parametrize(("own", "last", "told"), [(2.0, 2.68, ["+34.0\N{NO-BREAK SPACE}%"]), (2.0, 1.9, [])])
+def test_predictions_ten_seconds_ahead_that_get_worse_are_on_the_first_screen(
+    own: float, last: float, told: list[str]
+) -> None:
+    rungs = {"one set of parameters for all": 3.0, "parameters of every driver": own, "a law": last}
+    report = SimpleNamespace(ladder=SimpleNamespace(ten_s_m=rungs))
+    assert [text for _, _, text in page._later(report)] == told  # type: ignore[arg-type]
 
 
 def test_words_of_none_claim_no_cause() -> None:

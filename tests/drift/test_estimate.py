@@ -15,7 +15,7 @@ import torch
 pytest.importorskip("numba")
 
 from idm_env.data import Episode, Trajectories, episodes
-from idm_env.drift import forecast, kinds
+from idm_env.drift import forecast, held_out, kinds
 from idm_env.drift.estimate import Estimate, estimate, usual
 from idm_env.drift.job import _sorts, drift_file, sentence
 from idm_env.drift.kinds import tell
@@ -184,6 +184,19 @@ def test_what_is_not_finite_or_at_a_limit_is_not_estimated(monkeypatch: pytest.M
     vague = replace(right, log_error=np.where([n.endswith("memory_time") for n in right.names], 20.0, right.log_error))
     told = sentence(replace(one, found={"wander": vague}, one_of=("wander",)))
     assert "s (these data do not tell it)" in told and " to " in told and "e+" not in told
+
+
+@pytest.mark.parametrize(("wide", "narrow"), [(1.0, False), (1.6, True)])
+def test_bands_that_are_too_narrow_are_told_with_their_widening(wide: float, narrow: bool) -> None:
+    """Truths are ``wide`` times as far apart as the draws: that is the factor, and the words come with it."""
+    random = np.random.default_rng(3)
+    draws, truth = random.standard_normal((2000, 4000)), wide * random.standard_normal(4000)
+    factor = forecast.widening(draws, truth, 0.9)
+    assert factor == pytest.approx(wide, rel=0.05)
+    held = 100.0 * float(forecast.covers(draws, truth, 0.9)[0].mean())
+    row = {"model": "wander", "ahead_s": 10.0, "gap_crps_m": 1.0, "in_90_percent": held, "widening": factor}
+    told = held_out.sentence([row, {**row, "model": "no drift", "gap_crps_m": 2.0}], "wander", 5)[1]
+    assert (f"too narrow: {factor:.2f} times as wide it holds 90 %" in told) is narrow
 
 
 def test_scores_of_a_known_normal() -> None:
