@@ -154,22 +154,17 @@ def _fitted_on(value: Any) -> dict[str, Any]:
 
 def save_model(path: str | Path, model: Model) -> None:
     """Write a model as ``model.yaml``; ``load_model`` gives the same model back."""
-    content: dict[str, Any] = {
-        "configures": "model",
-        "schema": SCHEMA,
-        "dt": model.dt,
-        "integration": model.integration,
-        "effects": [describe(effect) for effect in model.effects],
-        "parameters": {e: {n: float(x) for n, x in values.items()} for e, values in model.parameters.items()},
-    }
+
+    def floats(layer: Numbers) -> Numbers:
+        return {e: {n: float(x) for n, x in values.items()} for e, values in layer.items()}
+
+    content: dict[str, Any] = {"configures": "model", "schema": SCHEMA, "dt": model.dt}
+    content |= {"integration": model.integration, "effects": [describe(effect) for effect in model.effects]}
+    content["parameters"] = floats(model.parameters)
     if model.substeps is not None:
         content["substeps"] = model.substeps
     if model.drivers:
-        content["by"] = model.by
-        content["drivers"] = {
-            key: {e: {n: float(x) for n, x in values.items()} for e, values in layer.items()}
-            for key, layer in model.drivers.items()
-        }
+        content |= {"by": model.by, "drivers": {key: floats(layer) for key, layer in model.drivers.items()}}
     if model.fitted_on:
         content["fitted_on"] = model.fitted_on
     text = _yaml().safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)

@@ -250,16 +250,12 @@ class CarFollowing(Effect):
         super().__init_subclass__()
         if not vars(cls).get("kind"):  # a base of laws: what it lacks its heirs have
             return
-        lacks = [
-            what
-            for what, present in (
-                ("equation: override accelerate", cls.accelerate is not CarFollowing.accelerate),
-                ("driver: override driver", cls.driver is not CarFollowing.driver),
-                ("parameters: declare some", cls.declared or cls.parameters is not Effect.parameters),
-            )
-            if not present
-        ]
-        if lacks:
+        has = {
+            "equation: override accelerate": cls.accelerate is not CarFollowing.accelerate,
+            "driver: override driver": cls.driver is not CarFollowing.driver,
+            "parameters: declare some": cls.declared or cls.parameters is not Effect.parameters,
+        }
+        if lacks := [what for what, present in has.items() if not present]:
             raise TypeError(f"car-following law {cls.__name__} has no {'; no '.join(lacks)}.")
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:

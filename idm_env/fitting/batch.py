@@ -149,17 +149,11 @@ class Batch:
         """
         vehicles, driver = self.columns(simulator)
         position = self.position[1:, :, vehicles]
-        active = torch.arange(position.shape[-1]) != driver
-        measured = {
-            Replayed: Replayed(
-                position,
-                self.all_speed[1:, :, vehicles],
-                self.accel[1:, :, vehicles],
-                active.expand_as(position),
-                self.present[1:, :, vehicles] if vehicles != slice(1, 3) else None,
-            ),
-            Adjacent: Adjacent(*(x[:-1, :, None].expand_as(position) for x in self.beside)),
-        }
+        speed, accel, present = (x[1:, :, vehicles] for x in (self.all_speed, self.accel, self.present))
+        active = (torch.arange(position.shape[-1]) != driver).expand_as(position)
+        record = Replayed(position, speed, accel, active, present if vehicles != slice(1, 3) else None)
+        adjacent = Adjacent(*(x[:-1, :, None].expand_as(position) for x in self.beside))
+        measured = {Replayed: record, Adjacent: adjacent}
         taking = {e.name: e.takes for e in simulator.effects if e.takes is not None}
         for name, what in taking.items():
             if what not in measured:

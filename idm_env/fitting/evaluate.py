@@ -28,14 +28,10 @@ class Errors(NamedTuple):
 
     def summary(self) -> dict[str, float]:
         """Return means over episodes, the median gap RMSE, and how many episodes end in a collision."""
-        return {
-            "gap_rmse_m": float(self.gap_rmse.mean()),
-            "gap_rmse_median_m": float(self.gap_rmse.median()),
-            "gap_mae_m": float(self.gap_mae.mean()),
-            "speed_rmse_mps": float(self.speed_rmse.mean()),
-            "collisions": int((self.smallest_gap <= 0).sum()),
-            "episodes": len(self.gap_rmse),
-        }
+        of_gap = {"gap_rmse_m": float(self.gap_rmse.mean()), "gap_rmse_median_m": float(self.gap_rmse.median())}
+        others = {"gap_mae_m": float(self.gap_mae.mean()), "speed_rmse_mps": float(self.speed_rmse.mean())}
+        counts = {"collisions": int((self.smallest_gap <= 0).sum()), "episodes": len(self.gap_rmse)}
+        return of_gap | others | counts
 
 
 def errors(problem: Problem, own: Tensor, shared: Tensor) -> tuple[Errors, Simulated]:
@@ -50,17 +46,10 @@ def errors(problem: Problem, own: Tensor, shared: Tensor) -> tuple[Errors, Simul
     count = weight.sum(0) + 1.0
     gap = (simulated.gap - problem.batch.gap[1:]) * weight
     speed = (simulated.speed - problem.batch.speed[1:]) * weight
+    gap_rmse, speed_rmse = ((x.square().sum(0) / count).sqrt() for x in (gap, speed))
     smallest = torch.where(weight > 0, simulated.gap, torch.inf).amin(0)
-    return (
-        Errors(
-            (gap.square().sum(0) / count).sqrt(),
-            gap.abs().sum(0) / count,
-            (speed.square().sum(0) / count).sqrt(),
-            smallest,
-            (problem.batch.gap[1:] * weight).sum(0) / weight.sum(0),
-        ),
-        simulated,
-    )
+    mean = (problem.batch.gap[1:] * weight).sum(0) / weight.sum(0)
+    return Errors(gap_rmse, gap.abs().sum(0) / count, speed_rmse, smallest, mean), simulated
 
 
 def pooled_errors(problem: Problem, own: Tensor, shared: Tensor, items: Sequence[Episode]) -> Errors:

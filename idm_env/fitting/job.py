@@ -168,23 +168,18 @@ def _write(
     error = joined.errors.summary()
     bounds, many = drivers.bounds(estimates), len(estimates.groups) > drivers.MOST_ROWS
     failed, rest = drivers.failure(bounds, joined.errors), held_out or {}
+    unseen = rest.get("gap_rmse_m"), options.by, rest.get("parts", "runs")
+    fit = {**error, "groups": len(estimates.groups), "converged": joined.converged, "iterations": joined.iterations}
     result: dict[str, Any] = {
         "schema": 1,
         "command": page.command_line(),
         "data": data,
         "options": {**vars(options), "free": estimates.names},
-        "fit": {
-            **error,
-            "groups": len(estimates.groups),
-            "converged": joined.converged,
-            "iterations": joined.iterations,
-        },
+        "fit": fit,
         "held_out": held_out,
         "failed": failed,
         "at_bounds": drivers.sentence(bounds),
-        "over_fitting": drivers.over_fitting(
-            bounds, error["gap_rmse_m"], rest.get("gap_rmse_m"), options.by, rest.get("parts", "runs")
-        ),
+        "over_fitting": drivers.over_fitting(bounds, error["gap_rmse_m"], *unseen),
         "bounds": bounds,
         "parameters": [],
         "versions": page.versions(),
@@ -394,17 +389,8 @@ def _simulated_table(problem: Problem, simulated: Simulated, row: int) -> pl.Dat
     size = len(episode)
     gap = torch.cat((problem.batch.gap[:1, row], simulated.gap[: size - 1, row])).numpy()
     speed = torch.cat((problem.batch.speed[:1, row], simulated.speed[: size - 1, row])).numpy()
-    return pl.DataFrame(
-        {
-            "run_id": episode.run_id,
-            "vehicle_id": episode.vehicle_id,
-            "leader_id": episode.leader_id,
-            "time_s": episode.time_s,
-            "position_m": episode.leader.position_m - episode.leader.length_m - gap,
-            "speed_mps": speed,
-            "length_m": episode.length_m,
-            "gap_m": gap,
-            "measured_gap_m": episode.gap_m,
-            "measured_speed_mps": episode.speed_mps,
-        }
-    )
+    names = {name: getattr(episode, name) for name in ("run_id", "vehicle_id", "leader_id", "time_s")}
+    place = episode.leader.position_m - episode.leader.length_m - gap
+    motion = {"position_m": place, "speed_mps": speed, "length_m": episode.length_m, "gap_m": gap}
+    measured = {"measured_gap_m": episode.gap_m, "measured_speed_mps": episode.speed_mps}
+    return pl.DataFrame(names | motion | measured)

@@ -247,15 +247,9 @@ def _together(
         data = problem.normal(own, shared)
     # Own parameters that gain little alone say nothing of a step of the shared ones that was refused.
     decisive = (gain > 0.0 and best < len(SIZES)) or 0.0 <= promised <= tolerance * total or shared_damping > 1e6
-    return replace(
-        progress,
-        own=own,
-        shared=shared,
-        damping=_redamped(progress.damping, better),
-        iteration=progress.iteration + 1,
-        shared_damping=max(shared_damping, 1e-9),
-        finished=gain <= tolerance * total and decisive,
-    ), data
+    damping, finished = _redamped(progress.damping, better), gain <= tolerance * total and decisive
+    progress = replace(progress, own=own, shared=shared, damping=damping, iteration=progress.iteration + 1)
+    return replace(progress, shared_damping=max(shared_damping, 1e-9), finished=finished), data
 
 
 def _judged(problem: LeastSquares, prior: Known | None, own: Tensor, shared: Tensor) -> tuple[Tensor, Tensor]:

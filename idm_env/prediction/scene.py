@@ -130,13 +130,8 @@ class MapScene:
         first = self.present - len(valid) + 1 + (int(broken[-1]) + 1 if len(broken) else 0)
         front = 0.5 * agent.length
         stop = self.lines.next_stop(route, front, self.speed(agent))
-        return Second(
-            route,
-            self.speeds(agent)[first:],
-            RouteLeader(past.rear[first:], past.speed[first:], past.passed),
-            front,
-            stop,
-        )
+        ahead = RouteLeader(past.rear[first:], past.speed[first:], past.passed)
+        return Second(route, self.speeds(agent)[first:], ahead, front, stop)
 
     def travelled(self, index: int, depth: int) -> np.ndarray:
         """Return how far an agent will have gone at every step [S] (m): the middle driver on its likeliest route."""

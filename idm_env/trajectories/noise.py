@@ -63,12 +63,7 @@ def outlying(position: np.ndarray) -> np.ndarray:
     return np.where(np.abs(rest) > 5.0 * scale + 1e-3, 100.0 * (rest * rest + 1e-6), 0.0)
 
 
-def fit_noise(
-    tracks: Sequence[tuple[np.ndarray, np.ndarray]],
-    dt: float,
-    start: PositionNoise | None = None,
-    evaluations: int = 110,
-) -> PositionNoise:
+def fit_noise(tracks: Sequence[tuple[np.ndarray, np.ndarray]], dt: float, evaluations: int = 110) -> PositionNoise:
     """Return the noise model under which the tracks (times, positions) are most likely.
 
     Four numbers for dense data (white, correlated, its time, jerk), by a simplex search over their logarithms; jerk and
@@ -84,8 +79,8 @@ def fit_noise(
     inflated = [outlying(position) if dense else np.zeros(len(position)) for _, position in parts]
     search = _Search(observed, inflated, evaluations)
     if dense:
-        return search.best(start or PositionNoise(0.1, 0.2, 0.3, 0.5), ("white", "sigma", "time", "jerk"))[0]
-    clean, cost = search.best(start or PositionNoise(SPARSE_WHITE_M, 0.0, 0.3, 0.5, 5.0), ("jerk", "accel_time"))
+        return search.best(PositionNoise(0.1, 0.2, 0.3, 0.5), ("white", "sigma", "time", "jerk"))[0]
+    clean, cost = search.best(PositionNoise(SPARSE_WHITE_M, 0.0, 0.3, 0.5, 5.0), ("jerk", "accel_time"))
     if usual > TELLING_S:
         return clean
     noisy, less = search.best(PositionNoise(NOISY_WHITE_M, 0.0, 0.3, 0.5, 5.0), ("white", "jerk", "accel_time"))

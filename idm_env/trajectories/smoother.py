@@ -137,12 +137,8 @@ def log_likelihood(observed: TrackObservations, noise: PositionNoise, inflated: 
     spread[3, 3] = noise.sigma**2
     variance = np.full(len(observed.at), noise.white**2) if inflated is None else noise.white**2 + inflated
     keep, fade, push, drift = noise.step(observed.dt)
-    return float(
-        loops.likelihood(
-            observed.steps, observed.at, observed.look, observed.value, variance, start, spread,
-            observed.dt, keep, fade, push, drift,
-        )
-    )  # fmt: skip
+    seen = (observed.steps, observed.at, observed.look, observed.value)
+    return float(loops.likelihood(*seen, variance, start, spread, observed.dt, keep, fade, push, drift))
 
 
 def smooth(observed: TrackObservations, noise: PositionNoise, options: SmootherOptions = SmootherOptions()) -> Smoothed:
