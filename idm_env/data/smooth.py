@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import solveh_banded
 
 JERK_DENSITY = 0.3
 """Spectral density of a driver's jerk, m²/s⁵: a jerk of 0.4 m/s³ that lasts for about 1 s. On a known truth with
@@ -120,6 +119,8 @@ def _solve(
         columns, values = _speed_rows(length, dt)
         matrix += _bands((columns, values), speed_weight, length)
         np.add.at(right, columns.ravel(), (values * (speed_weight * rates)[:, None]).ravel())
+    from scipy.linalg import solveh_banded  # a fifth of a second, which no refusal waits for
+
     return solveh_banded(matrix, right, lower=True, check_finite=False)
 
 
