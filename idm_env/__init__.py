@@ -27,30 +27,14 @@ _TASKS = (
 )  # fmt: skip
 """The keys of ``idm_env.tasks.TASKS``, which needs torch."""
 
-__all__ = [
-    "IDM",
-    "Brakes",
-    "Command",
-    "Control",
-    "Effect",
-    "Lane",
-    "Lanes",
-    "Parameter",
-    "Record",
-    "Replay",
-    "Ring",
-    "Simulator",
-    "State",
-    "Trajectory",
-    "__version__",
-]
+__all__ = ["__version__", *(name for names in _LAZY.values() for name in names)]
 
 if TYPE_CHECKING:
-    from idm_env.effects import IDM, Brakes, Control, Effect, Replay
-    from idm_env.parameters import Parameter
-    from idm_env.roads import Lane, Lanes, Ring
-    from idm_env.simulator import Simulator, Trajectory
-    from idm_env.types import Command, Record, State
+    from idm_env.effects import IDM as IDM, Brakes as Brakes, Control as Control, Effect as Effect, Replay as Replay
+    from idm_env.parameters import Parameter as Parameter
+    from idm_env.roads import Lane as Lane, Lanes as Lanes, Ring as Ring
+    from idm_env.simulator import Simulator as Simulator, Trajectory as Trajectory
+    from idm_env.types import Command as Command, Record as Record, State as State
 
 
 def _task_id(task: str) -> str:

@@ -129,19 +129,12 @@ def _model(content: dict[str, Any]) -> Model:
         raise ValueError(f"schema = {shown(content['schema'])} is unknown; this version reads schema {SCHEMA}.")
     if not content.get("effects"):
         raise ValueError("a model needs effects, and none are given. Write 'effects: [idm, brakes]'.")
-    return Model(
-        effects=make_effects(content["effects"]),
-        parameters=numbers(content.get("parameters") or {}),
-        dt=number("dt", content.get("dt", 0.1)),
-        integration=content.get("integration", "ballistic"),
-        drivers={
-            str(key): numbers(_mapping(f"drivers.{shown(key)}", value))
-            for key, value in _mapping("drivers", content.get("drivers") or {}).items()
-        },
-        by=_text("by", content.get("by", "driver")),
-        substeps=content.get("substeps"),
-        fitted_on=_fitted_on(content.get("fitted_on") or {}),
-    )
+    effects, values = make_effects(content["effects"]), numbers(content.get("parameters") or {})
+    dt, integration = number("dt", content.get("dt", 0.1)), content.get("integration", "ballistic")
+    layers = _mapping("drivers", content.get("drivers") or {}).items()
+    drivers = {str(key): numbers(_mapping(f"drivers.{shown(key)}", value)) for key, value in layers}
+    by, fitted_on = _text("by", content.get("by", "driver")), _fitted_on(content.get("fitted_on") or {})
+    return Model(effects, values, dt, integration, drivers, by, content.get("substeps"), fitted_on)
 
 
 def _fitted_on(value: Any) -> dict[str, Any]:

@@ -254,7 +254,7 @@ def top_level() -> set[str]:
         (circles, 0),
         (ways_up, 0),
         (classes_named_twice, 7),
-        (lines_of_code, 35662),
+        (lines_of_code, 35630),
         (functions_of_many_parameters, 15),
         (high_packages, 1),
         (file_names_twice, 25),

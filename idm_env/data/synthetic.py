@@ -92,16 +92,11 @@ def generate(
     drivers = _drivers(random, shape, spread)
     script = scripted.lapping if laps else scripted.leaders
     leader = script(random, runs, steps, step, 0.8 * drivers.desired_speed.min())
-    platoon = Platoon(
-        leader=leader,
-        beside=scripted.adjacent_queue(leader) if "lateral" in on else None,
-        drivers=drivers,
-        lengths=random.uniform(4.0, 5.2, (runs, 1 + followers)),
-        starts=dt * random.integers(0, round(LATEST_START_S / dt), runs),
-        step=step,
-        on=on,
-        noise=scripted.ornstein_uhlenbeck(random, (steps, *shape), ou, ou_time, step),
-    )
+    queue = scripted.adjacent_queue(leader) if "lateral" in on else None
+    lengths = random.uniform(4.0, 5.2, (runs, 1 + followers))
+    starts = dt * random.integers(0, round(LATEST_START_S / dt), runs)
+    unrest = scripted.ornstein_uhlenbeck(random, (steps, *shape), ou, ou_time, step)
+    platoon = Platoon(leader, queue, drivers, lengths, starts, step, on, unrest)
     truth = Truth(on, _driver_table(drivers), _motion_table(platoon, platoon.run(), dt), noise, ou)
     table = _measured(random, truth, noise, correlated_noise, speed_noise, dt)
     if gap_column or "gap_bias" in on:
@@ -170,13 +165,9 @@ def _motion_table(platoon: Platoon, motion: PlatoonMotion, dt: float) -> pl.Data
 
 def _driver_table(drivers: Drivers) -> pl.DataFrame:
     runs, followers = drivers.time_gap.shape
-    return pl.DataFrame(
-        {
-            "run_id": np.repeat(np.arange(1, runs + 1), followers).astype(str),
-            "vehicle_id": np.tile(np.arange(2, followers + 2), runs).astype(str),
-            **{field.name: getattr(drivers, field.name).ravel() for field in fields(Drivers)},
-        }
-    )
+    run, vehicle = np.repeat(np.arange(1, runs + 1), followers), np.tile(np.arange(2, followers + 2), runs)
+    values = {field.name: getattr(drivers, field.name).ravel() for field in fields(Drivers)}
+    return pl.DataFrame({"run_id": run.astype(str), "vehicle_id": vehicle.astype(str), **values})
 
 
 def _measured(
