@@ -12,8 +12,8 @@ keywords of ``GIVEN``:
   is worth.
 
 Beside each its CPU seconds of one thread, crashes, and the 95 % interval of the paired difference over episodes. A
-*first task* has zero, constants and random at most at 0.3, and PPO at least at 0.7 with 4 of 5 seeds in 120 CPU s;
-the others are demonstrations. A row that is done is kept in ``--out``; ``docs/skill.csv`` has them all.
+*first task* has zero, constants and random at most at 0.3, and PPO at least at 0.7 with 4 of 5 seeds in 120 CPU s.
+Rows are kept in ``--out``; ``docs/skill.csv`` has them all.
 """
 
 from __future__ import annotations
@@ -301,7 +301,7 @@ def main(
         parts += [Part(task, row, seed) for row in learns for seed in range(seeds)]
         done = named_rows(row_of, {str(part): part for part in parts}, out, place)
         lines = skills({part: done[str(part)] for part in parts})
-        print(table(head, lines), f"\n{task}: a {'first task' if teaches(lines) else 'demonstration'}\n")
+        print(table(head, lines), f"\n{task}: a {'first task' if teaches(lines) else 'task that is no first one'}\n")
         old = list(csv.reader(file.open(encoding="utf-8")))[1:] if file.exists() else []
         every = sorted([x for x in old if x[0] != task] + lines, key=lambda x: list(TASKS).index(x[0]))
         with file.open("w", encoding="utf-8", newline="") as out_file:
