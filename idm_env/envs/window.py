@@ -171,8 +171,7 @@ class _Segment(NamedTuple):
 
 def _columns(loops: RowFunction, pointers: Mapping[str, Any], steps: int) -> Array:
     """Return tables of the loops of a policy, one for each step."""
-    columns = np.empty((steps, len(loops.table({}))), np.int64)
-    columns[:] = loops.table({})
+    columns = np.tile(loops.table({}), (steps, 1))
     for name in (*loops.needs, *loops.outs, *getattr(loops, "sums", ())):
         columns[:, loops.place(name)] = pointers[name]
     return columns

@@ -68,6 +68,22 @@ def test_searches_rolls_and_reductions_by_index():
         assert np.array_equal(out[name], x.numpy()), name
 
 
+def test_what_is_computed_twice_is_computed_once_unless_it_is_written_to():
+    """The same operation of the same numbers has one result; copies that are changed are apart."""
+
+    def function(x):
+        twice = x.exp() + x.exp(), x.exp() + x.roll(1, -1).exp()
+        doubled = x.clone().mul_(2.0)
+        return {"a": twice[0], "b": twice[1], "c": doubled, "d": x.clone().add_(doubled), "e": x.clone()}
+
+    x = torch.rand(MANY, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    loops = RowFunction(function, {"x": x}, MANY)
+    out = called(loops, {"x": x.numpy()})
+    for name, expected in function(x).items():
+        np.testing.assert_allclose(out[name], expected[:ROWS].numpy(), rtol=1e-15)
+    assert sum(key[0] == "exp" for key in loops._results) == 2
+
+
 def test_infinity_is_looked_for_in_numbers_of_their_own_kind():
     """It was looked for in truth values, among which there is none."""
     numbers = torch.tensor([[0.0, torch.inf, 1.0, -torch.inf, 2.0]]).expand(MANY, -1).contiguous()

@@ -117,13 +117,10 @@ class Traffic:
         self.rows = state.speed.numel() // self.n
         self._take(state.lanes)
         self._kind = state.speed.detach().numpy().dtype
+        self._deciding = Deciding(simulator, self.rows, self.n, self._kind)
         self._ring = float(self.road.ring or 0.0)
         self._lasting: _Lasting | None = None
         self._order: tuple[Array, Array] | None = None
-
-    @cached_property
-    def _deciding(self) -> Deciding:
-        return Deciding(self.simulator, self.rows, self.n, self._kind)
 
     @property
     def lanes(self) -> LaneState:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from idm_env.compiled.kernels.compiler import apart
-from idm_env.compiled.kernels.memory import copy
 from idm_env.compiled.kernels.tiles import exact
 
 
@@ -90,25 +89,6 @@ def lay(order, begin, n, count, halo, wide, base, to, slots, own, led, leads):
     while p < to + wide:
         slots[p], led[p], leads[p] = 0, 0, 0
         p += 1
-
-
-@apart
-def sort(key, order, spare, n):
-    """Put numbers in order of their keys, equal ones as they are; numpy's sort compiles ten times as long."""
-    for i in range(n):
-        order[i] = i
-    run = 1
-    while run < n:
-        for low in range(0, n, 2 * run):
-            i, middle, end = low, min(low + run, n), min(low + 2 * run, n)
-            j = middle
-            for to in range(low, end):
-                if i < middle and (j >= end or key[order[i]] <= key[order[j]]):
-                    spare[to], i = order[i], i + 1
-                else:
-                    spare[to], j = order[j], j + 1
-        copy(order, 0, spare, 0, n)
-        run *= 2
 
 
 @exact

@@ -153,6 +153,8 @@ class RowFunction:
         _refuse_forks(operations, list(inputs.values()))
         calls = _needed(operations, list(results.values()))
         self._calls = calls
+        self._results: dict[Any, int] = {}
+        self._written = {storage(x) for name, _, _, out in calls if _in_place(name) for x in tensors((out,))}
         read = {storage(x) for _, args, _, _ in calls for x in tensors(args)} | {storage(x) for x in results.values()}
         self._parts += [lines for where, lines in self._loads.items() if where in read]
         for call in calls:
@@ -340,7 +342,7 @@ class RowFunction:
         if name == "sort":
             self._parts.append(self._sorted(args, kwargs, out))
             return
-        inplace = name.endswith("_") and not name.endswith("__")
+        inplace = _in_place(name)
         for x in out if isinstance(out, (list, tuple)) else (out,):
             if inplace:
                 name = name.removesuffix("_")
@@ -353,8 +355,31 @@ class RowFunction:
             else:
                 if x.dim() == 0 or x.shape[0] != self._rows:
                     raise Untraceable(f"{name} mixes rows")
+                if self.lean and self._computed(name, args, kwargs, x):
+                    continue
                 to = self._fresh(x)
             self._parts.append(self._compute(name, args, kwargs, x, to))
+
+    def _computed(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor) -> bool:
+        """Give a result the place of one that is the same operation of the same numbers; False for the first one."""
+
+        def mark(part: Any) -> Any:
+            if isinstance(part, (list, tuple)):
+                return tuple(map(mark, part))
+            if not isinstance(part, Tensor):
+                return repr(part)
+            one = part[0] if part.dim() and part.stride(0) == 0 else part
+            lies = self._stores.get(storage(part)) or one.detach().cpu().numpy().tobytes()
+            return part.dtype, part.shape, part.stride(), part.storage_offset(), lies
+
+        if any(storage(part) in self._written for part in (x, *tensors(args))):
+            return False
+        key = name, mark(args), mark(tuple(kwargs.items())), x.shape, x.stride()
+        first = self._results.setdefault(key, storage(x))
+        if first != storage(x):
+            self._stores[storage(x)] = self._stores[first]
+            self._place(x)
+        return first != storage(x)
 
     def _began(self, x: Tensor) -> None:
         """Give a constant of one value, that is written to now, a place."""
@@ -657,6 +682,11 @@ class RowFunction:
         return self._each(
             to, x.shape[1:], lambda cell: index(table, [*(self._at(p, cell[:own]) for p in parts), *cell[own:]])
         )
+
+
+def _in_place(name: str) -> bool:
+    """Return whether an operation writes to its first argument."""
+    return name.endswith("_") and not name.endswith("__")
 
 
 def storage(x: Tensor) -> int:

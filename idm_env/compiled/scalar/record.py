@@ -199,14 +199,8 @@ def record(simulator: CarFollowingStep, form: Form, graph: Graph | None = None) 
     judged = graph is None
     graph = Graph() if graph is None else graph
     recording = Recording(graph)
-    recorder = _Recorder(
-        SeenRoad(simulator.road, graph),
-        simulator.effects,
-        TimeStep(simulator.dt),
-        simulator.integration,
-        recording=recording,
-    )
-
+    road, dt = SeenRoad(simulator.road, graph), TimeStep(simulator.dt)
+    recorder = _Recorder(road, simulator.effects, dt, simulator.integration, recording=recording)
     state = state_of(form, graph)
     params = Parameters(recorder, graph)
     try:
