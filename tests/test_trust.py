@@ -314,7 +314,7 @@ READERS = {
     "yaml.parse": {"model_file.py"},
     "torch.load": {"jobs/storage.py", "agents/common.py", "agents/ppo.py"},
     "pickle.loads": {"jobs/executor.py", "compat.py"},
-    "import_module": {"data/__init__.py", "__init__.py", "backends.py", "effects/registry.py", "cli/commands.py"},
+    "import_module": {"data/__init__.py", "__init__.py", "backends.py", "effects/registry.py"},
     "spec_from_file_location": {"jobs/import_file.py"},
     "exec": {"compiled/kernels/compiler.py", "compiled/kernels/emitted.py"},
 }
