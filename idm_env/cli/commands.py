@@ -110,11 +110,7 @@ def _stop(number: int, frame: object) -> NoReturn:
 
 
 @app.command()
-def demo(
-    data: Path | None = None,
-    out: Path = options.OUT,
-    seed: Annotated[int, options.Limits(0, 1e9)] = 7,
-) -> None:
+def demo(data: Path | None = None, out: Path = options.OUT, seed: Annotated[int, options.Limits(0, 1e9)] = 7) -> None:
     """Generate platoons with a hidden effect, and find it: the whole of `explain` in half a minute.
 
     The data are written to OUT/platoon.csv first; nothing in them names the effect.
@@ -454,9 +450,10 @@ def explain(
     if not rows:
         answers.explained(result, models, out)
         return
-    answers.show(f"{len(rows)} data sets", [
-        {"set": row["set"], "verdict": row["verdict"].replace("_", " "), "effects": row["effects"]} for row in rows
-    ])  # fmt: skip
+    answers.show(
+        f"{len(rows)} data sets",
+        [{"set": row["set"], "verdict": row["verdict"].replace("_", " "), "effects": row["effects"]} for row in rows],
+    )
     answers.finished(out, f"Every set's own report is in {out}/NAME; sets.csv has them all.")
 
 

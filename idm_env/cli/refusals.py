@@ -64,7 +64,7 @@ def refuse_whole(given: Mapping[str, Any]) -> None:
     """
     data = given.get("data", given.get("source"))
     path = Path(data[0] if isinstance(data, list) else data or "")
-    if "columns" not in given or given.get("each") or not path.is_file() or path.suffix in (".yaml", ".yml"):
+    if given.get("each") or not path.is_file() or path.suffix in (".yaml", ".yml"):
         return
     options: dict[str, Any] = {name: given.get(name) for name in ("columns", "ring_length")}
     options["layout"] = given.get("layout", "auto")

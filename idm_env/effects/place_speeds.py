@@ -84,10 +84,8 @@ class CurveSpeed(Effect):
     acts_on = "desired_speed"
     rank = 1
     declared = (
-        Parameter(
-            "lateral_accel", "a_lat", "m/s²", 2.5, 0.2, 15.0, null=1e6, role="threshold", starts=(1.5, 3.0, 5.0),
-        ),
-    )  # fmt: skip
+        Parameter("lateral_accel", "a_lat", "m/s²", 2.5, 0.2, 15.0, null=1e6, role="threshold", starts=(1.5, 3.0, 5.0)),
+    )
     knots: tuple[float, ...] = (0.0, 250.0, 500.0, 750.0, 1000.0)
     profile: tuple[float, ...] = (0.0, 0.1, -0.06, 0.03, 0.0)
     period: float | None = None

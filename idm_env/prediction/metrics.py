@@ -26,9 +26,7 @@ DRAWS = 200
 """Of the bootstrap."""
 ENOUGH_SCENES = 10
 """From so many scenes on, intervals draw whole scenes."""
-SHAPES = (
-    "stationary", "straight", "straight left", "straight right", "left", "left U-turn", "right", "right U-turn",
-)  # fmt: skip
+SHAPES = ("stationary", "straight", "straight left", "straight right", "left", "left U-turn", "right", "right U-turn")
 
 
 @dataclass(frozen=True, eq=False)

@@ -293,9 +293,7 @@ def _packed(panel: Panel, together: Sequence[Panel], stride: int, fastest: float
             "breaks": (np.flatnonzero(~line.whole(panel.ring_length)) + 1).tolist(),
         })  # fmt: skip
     offsets, names = axes_of(panel, together)
-    return {
-        "title": panel.title, "time": time, "place": place, "vehicles": packed, "offsets": offsets, "names": names,
-    }  # fmt: skip
+    return {"title": panel.title, "time": time, "place": place, "vehicles": packed, "offsets": offsets, "names": names}
 
 
 def _bits(values: np.ndarray, low: float, high: float) -> str:

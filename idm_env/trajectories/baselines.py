@@ -151,10 +151,8 @@ BASELINES: dict[str, tuple[Smoother, tuple[Choice, ...]]] = {
     "moving average": (moving_average, tuple({"window": w} for w in (5, 9, 15, 21, 31, 41, 51, 61))),
     "exponential": (exponential, tuple({"width": w} for w in (3, 4, 5, 6, 7, 8, 10, 13, 17, 22))),
     "bounded spline": (bounded_spline, tuple({"spacing": s} for s in (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0))),
-    "Savitzky–Golay": (
-        savitzky_golay, tuple({"window": w, "order": o} for o in (2, 3, 5) for w in range(31, 122, 10)),
-    ),
-}  # fmt: skip
+    "Savitzky–Golay": (savitzky_golay, tuple({"window": w, "order": o} for o in (2, 3, 5) for w in range(31, 122, 10))),
+}
 """Name → function, and what a tuning tries of its free numbers."""
 
 
