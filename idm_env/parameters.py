@@ -21,7 +21,13 @@ from torch.distributions import biject_to, constraints
 from torch.distributions.transforms import Transform
 
 from idm_env.types import Params
-from idm_env.validation import at_least as at_least, nearest as nearest, one_of as one_of, shown, whole as whole
+from idm_env.validation import (
+    at_least as at_least,
+    nearest as nearest,
+    one_of as one_of,
+    shown as shown,
+    whole as whole,
+)
 
 Role = Literal["strength", "shape", "threshold", "place"]
 V = TypeVar("V")
@@ -110,6 +116,17 @@ def unconstrain(parameter: Parameter, value: Tensor, margin: float = 1e-4) -> Te
     return parameter.transform().inv(value.clamp(parameter.low + inside, parameter.high - inside))
 
 
+def refuse_incomplete(effects: Iterable[HasParameters], params: Params) -> None:
+    """Raise ValueError, in one line, for parameters that are no mapping of effects, and for missing ones."""
+    if not isinstance(params, Mapping) or not all(isinstance(part, Mapping) for part in params.values()):
+        raise ValueError(f"parameters = {shown(params)} must be effect → name → tensor, as simulator.defaults() gives.")
+    missing = next(
+        (f"{e.name}.{p.name}" for e in effects for p in e.parameters if p.name not in params.get(e.name, ())), ""
+    )
+    if missing:
+        raise ValueError(f"parameter '{missing}' is missing. Start from simulator.defaults() and change what differs.")
+
+
 def check(effects: Iterable[HasParameters], params: Params) -> None:
     """Raise ValueError, in one line, for unknown, missing, non-finite or out-of-range parameters.
 
@@ -117,21 +134,16 @@ def check(effects: Iterable[HasParameters], params: Params) -> None:
     """
     effects = tuple(effects)
     declared = catalogue(effects)
-    names = {e.name for e in effects}
-    if not isinstance(params, Mapping) or not all(isinstance(part, Mapping) for part in params.values()):
-        raise ValueError(f"parameters = {shown(params)} must be effect → name → tensor, as simulator.defaults() gives.")
+    refuse_incomplete((), params)
     for effect, values in params.items():
-        if effect not in names:
+        if effect not in (names := {e.name for e in effects}):
             raise ValueError(f"unknown effect {shown(effect)} in parameters.{nearest(effect, names)}")
-        for name in values:
-            if f"{effect}.{name}" not in declared:
-                raise ValueError(
-                    f"unknown parameter {shown(f'{effect}.{name}')}.{nearest(f'{effect}.{name}', declared)}"
-                )
+        for full in (f"{effect}.{name}" for name in values):
+            if full not in declared:
+                raise ValueError(f"unknown parameter {shown(full)}.{nearest(full, declared)}")
+    refuse_incomplete(effects, params)
     for full, p in declared.items():
         effect, name = full.split(".")
-        if effect not in params or name not in params[effect]:
-            raise ValueError(f"parameter '{full}' is missing. Start from simulator.defaults() and change what differs.")
         value = torch.as_tensor(params[effect][name]).detach()
         # Bounds are compared in float32 too, where 0.1 is not 0.1: a relative tolerance keeps a bound itself legal.
         slack = 1e-6 * max(abs(p.low), abs(p.high))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
@@ -59,15 +59,12 @@ class Simulator(CarFollowingStep):
         for name, value in inputs.items():
             if name not in self.by_name:
                 raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
-            have = min(len(x) for x in _leaves(value) if x is not None)
+            have = min(len(x) for x in ((value,) if isinstance(value, Tensor) else value) if x is not None)
             if have < steps:
                 raise ValueError(f"input '{name}' covers {have} steps of {steps}. Its first dimension is time.")
-        undrawn = next((name for name in self.draws if name not in inputs), None)
-        if undrawn is not None:
-            raise ValueError(
-                f"effect '{undrawn}' takes normals, and none were given. Draw them with seed=…, or pass "
-                f"inputs={{'{undrawn}': …}}."
-            )
+        if undrawn := [name for name in self.draws if name not in inputs]:
+            cure = f"Draw them with seed=…, or pass inputs={{'{undrawn[0]}': …}}."
+            raise ValueError(f"effect '{undrawn[0]}' takes normals, and none were given. {cure}")
 
     def slices(self, inputs: Inputs, steps: int) -> list[dict[str, Any]]:
         """Return the inputs of each step, from inputs with a leading time dimension.
@@ -83,8 +80,7 @@ class Simulator(CarFollowingStep):
 
         ``like`` has the shape ``(…, vehicles)``. The same seed gives the same normals, whatever else is simulated.
         """
-        missing = (name for name in self.draws if name not in inputs)
-        return {**inputs, **{name: normals(name, seed, like, steps) for name in missing}}
+        return {**inputs, **{n: normals(n, seed, like, steps) for n in self.draws if n not in inputs}}
 
     def rollout(
         self,
@@ -110,6 +106,10 @@ class Simulator(CarFollowingStep):
         gives (``drawn``). ValueError for inputs that are too short or of no effect.
         """
         parameters.whole("steps", steps, 1)
+        for name, value, kind in (("state", state, State), ("inputs", inputs, Mapping)):
+            if not isinstance(value, kind):
+                raise ValueError(f"{name} = {parameters.shown(value)} must be a {kind.__name__}.")
+        parameters.refuse_incomplete(self.effects, params)
         if seed is not None:
             inputs = self.drawn(state.speed, inputs, steps, seed)
         if keep in (_trajectory, None):
@@ -211,10 +211,6 @@ class Compiled(Simulator):
                 stacklevel=2,
             )
             return super().step(state, inputs, params)
-
-
-def _leaves(value: Any) -> Iterable[Any]:
-    return (value,) if isinstance(value, Tensor) else value
 
 
 def stacked(values: Sequence[Any]) -> Any:

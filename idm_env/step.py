@@ -229,26 +229,19 @@ class CarFollowingStep:
         start, from how they are in the long run; without it they begin at their mean. ValueError for shapes that do
         not fit.
         """
-        if position.shape != speed.shape or position.dim() == 0:
-            raise ValueError(
-                f"position {tuple(position.shape)} and speed {tuple(speed.shape)} must have one shape (…, vehicles)."
-            )
+        parameters.refuse_incomplete(self.effects, params)
+        shapes = [tuple(x.shape) if isinstance(x, Tensor) else parameters.shown(x) for x in (position, speed)]
+        if shapes[0] != shapes[1] or not isinstance(position, Tensor) or position.dim() == 0:
+            raise ValueError(f"position {shapes[0]} and speed {shapes[1]} must be tensors of one shape (…, vehicles).")
         length = torch.as_tensor(length, dtype=position.dtype, device=position.device).expand_as(position)
         if present is None and self.road.leaving:
             present = torch.ones_like(position.detach())
         if present is not None:
             present = present.to(position.dtype).expand_as(position)
-        start = State(
-            position=position,
-            speed=speed,
-            accel=torch.zeros_like(speed) if accel is None else accel,
-            gap=position,  # until the road is seen
-            length=length,
-            step=torch.as_tensor(step, device=position.device),
-            present=present,
-            memory={},
-            lanes=self.road.lane_state(position, length, lane, present),
-        )
+        still = torch.zeros_like(speed) if accel is None else accel
+        clock = torch.as_tensor(step, device=position.device)
+        lanes = self.road.lane_state(position, length, lane, present)
+        start = State(position, speed, still, position, length, clock, present, {}, lanes)  # gaps: once roads see it
         road = self.road.view(start)
         gap = road.gaps(position, length, circumference)
         if present is not None:

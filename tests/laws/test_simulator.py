@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
@@ -253,7 +254,7 @@ def test_errors_name_value_rule_and_cure() -> None:
         Simulator(Ring(20.0), (IDM(), Brakes())).state(torch.zeros(9), torch.zeros(9), params)
     with pytest.raises(ValueError, match="needs its circumference"):
         Simulator(Ring(), (IDM(), Brakes())).state(torch.zeros(2), torch.zeros(2), params)
-    with pytest.raises(ValueError, match="must have one shape"):
+    with pytest.raises(ValueError, match="must be tensors of one shape"):
         simulator.state(torch.zeros(3), torch.zeros(2), params)
     with pytest.raises(ValueError, match="given twice"):
         simulator.adding(Brakes())
@@ -261,3 +262,35 @@ def test_errors_name_value_rule_and_cure() -> None:
         simulator.without("nois")
     with pytest.raises(ValueError, match=r"integration = 'eulr' is unknown. Did you mean 'euler'"):
         Simulator(Lane(), (IDM(),), integration="eulr")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"state": None}, "state = None must be a State"),
+        ({"state": (1.0, 2.0)}, r"state = \(1.0, 2.0\) must be a State"),
+        ({"inputs": [1]}, r"inputs = \[1\] must be a Mapping"),
+        ({"params": None}, "parameters = None must be effect"),
+        ({"params": {}}, r"parameter 'idm\.max_accel' is missing"),
+        ({"params": {"idm": 1.0}}, "parameters = .* must be effect"),
+    ],
+    ids=str,
+)
+def test_what_a_rollout_does_not_take_is_one_line(wrong: dict[str, object], words: str) -> None:
+    simulator = Simulator(Lane(), (IDM(), Brakes()))
+    params = simulator.defaults()
+    state = simulator.state(torch.tensor([30.0, 0.0]), torch.tensor([10.0, 10.0]), params)
+    given: dict[str, object] = {"state": state, "inputs": {}, "params": params, **wrong}
+    with pytest.raises(ValueError, match=words) as told:
+        simulator.rollout(**given, steps=2)  # type: ignore[arg-type]
+    assert "\n" not in str(told.value)
+    if "params" in wrong:
+        with pytest.raises(ValueError, match=words):
+            simulator.state(state.position, state.speed, wrong["params"])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("wrong", [None, [30.0, 0.0], "a", np.array([30.0, 0.0])], ids=str)
+def test_a_start_is_made_of_tensors(wrong: object) -> None:
+    simulator = Simulator(Lane(), (IDM(), Brakes()))
+    with pytest.raises(ValueError, match="must be tensors of one shape"):
+        simulator.state(wrong, torch.tensor([10.0, 10.0]), simulator.defaults())  # type: ignore[arg-type]
