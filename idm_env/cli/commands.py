@@ -28,12 +28,18 @@ class _Refusing(typer.core.TyperCommand):
     """A command whose refusals come before its function imports anything slow."""
 
     def invoke(self, ctx: Any) -> Any:
-        refusals.refuse(ctx.params)
+        from idm_env.data import plain
+
         page.ASKED.set(_typed_words(str(ctx.info_name), ctx.params))
-        for name in options.FILES:
-            if isinstance(ctx.params.get(name), list) and not ctx.params.get("each"):
-                _join(ctx.params, name)
-        refusals.refuse_whole(ctx.params)
+        with shown(console) as report:  # a large file of XML takes seconds
+            plain.ON_PART.set(
+                lambda done, total: report("reading", done, total, "") if total >= refusals.LARGE_BYTES else None
+            )
+            refusals.refuse(ctx.params)
+            for name in options.FILES:
+                if isinstance(ctx.params.get(name), list) and not ctx.params.get("each"):
+                    _join(ctx.params, name)
+            refusals.refuse_whole(ctx.params)
         super().invoke(ctx)
         if following := page.next_command(ctx.params.get("out", options.OUT)):
             console.print(f"Next: {following}", soft_wrap=True, highlight=False)

@@ -20,7 +20,8 @@ CHOICES = {
 }
 """Options of few words, and the words. Those who use them declare them; a test holds both together."""
 SMALL_BYTES, LARGE_BYTES = 1 << 20, 1 << 26
-"""Files up to the first are spooled, up to the second read as a whole before anything slow is imported."""
+"""Files up to the first are spooled, up to the second read as a whole before anything slow is imported; XML from
+the second on shows its progress."""
 
 
 def refuse(given: Mapping[str, Any]) -> None:

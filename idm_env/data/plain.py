@@ -12,8 +12,9 @@ import re
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
+from contextvars import ContextVar
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,8 @@ SUMO_LENGTHS_M |= {"moped": 2.1, "bicycle": 1.6, "scooter": 1.2}
 TYPES_READ = 1 << 20
 """Characters of a file of routes in which vTypes are looked for."""
 HEAD, TAB, NL = 1 << 16, "\t", "\n"
+ON_PART: ContextVar[Callable[[int, int], None] | None] = ContextVar("ON_PART", default=None)
+"""Called with how many bytes of a file of XML are read, and of how many."""
 _copies: dict[tuple[str, int, int], Path] = {}
 """Copies by file, size and time, until the process ends."""
 
@@ -88,7 +91,7 @@ def _rewritten(path: Path, files: ExitStack) -> Iterable[str] | None:
     file: Any = files.enter_context(gzip.GzipFile(fileobj=raw)) if name.endswith(".gz") else raw
     head = file.read(HEAD)
     if head.lstrip()[:1] == b"<" or ".xml" in name:
-        return _of_sumo(path, head, file)
+        return _of_sumo(path, head, file, raw)
     encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
     lines = head.decode(encoding, "replace").removeprefix("\ufeff").splitlines()
     first = lines[0] if lines else ""
@@ -151,11 +154,12 @@ def _of_sheet(path: Path) -> Iterable[str]:
         raise DataError(f"{path.name} cannot be read as a workbook ({str(error).partition(NL)[0]}); {cure}.") from None
 
 
-def _of_sumo(path: Path, head: bytes, file: Any) -> Iterator[str]:
+def _of_sumo(path: Path, head: bytes, file: Any, raw: Any) -> Iterator[str]:
     """Yield floating-car data of XML line by line, under the names of SUMO, with the lengths of vehicles' types.
 
-    Attributes are those of the first vehicle.
+    Attributes are those of the first vehicle. ``raw`` is the packed file, which says how much of it is read.
     """
+    on_part, size = ON_PART.get(), path.stat().st_size
     lengths = _lengths(path, head.decode("utf-8", "replace"))
     names: list[str] = []
     time, root = "", ""
@@ -163,6 +167,8 @@ def _of_sumo(path: Path, head: bytes, file: Any) -> Iterator[str]:
     try:
         for part in chain([head], iter(lambda: file.read(HEAD), b"")):
             parser.feed(part)
+            if on_part is not None:
+                on_part(min(raw.tell(), size), size)
             for event, element in parser.read_events():
                 root = root or element.tag
                 if root != "fcd-export":

@@ -90,7 +90,7 @@ def drift_file(
         }  # fmt: skip
         storage.write_json(out / "report.json", result)
         title, template = f"How the drivers of {trajectories.source} drift", Path(__file__).with_name("drift.html")
-        page.write_page(out / "report.html", title, template=template, r=result, tables=tables, picture=_picture)
+        page.write_page(out / "report.html", title, template=template, r=result, tables=tables)
         store.remove()
         return result
 
@@ -158,18 +158,8 @@ def tables(report: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
         f"Forecasts of the gap of {report['kept_back']['drivers']} drivers kept back": report["kept_back"]["scores"],
         "Stochastic variants against the deterministic model": report["sorts"],
     }
-    hidden = ("forecasts", "in_50_percent")
-    cells = {title: [{k: v for k, v in row.items() if k not in hidden} for row in rows] for title, rows in both.items()}
-    return {
-        title: [{names.get(k, k): v for k, v in row.items()} for row in rows] for title, rows in cells.items() if rows
-    }
 
+    def row_in_words(row: dict[str, Any]) -> dict[str, Any]:
+        return {names.get(k, k): row[k] for k in row if k not in ("forecasts", "in_50_percent")}
 
-def _picture(scores: list[dict[str, Any]]) -> page.Block:
-    figure, ((axis,),) = page.figure(size=(7.0, 3.2))
-    for model in dict.fromkeys(row["model"] for row in scores):
-        rows = [row for row in scores if row["model"] == model]
-        axis.plot([r["ahead_s"] for r in rows], [r["gap_crps_m"] for r in rows], marker=".", label=model)
-    axis.set(xlabel="time ahead (s)", ylabel="CRPS of the gap (m)", ylim=(0.0, None))
-    axis.legend(frameon=False)
-    return page.picture(figure, "Forecasts of drivers kept back: the lower, the better.")
+    return {title: [row_in_words(row) for row in rows] for title, rows in both.items() if rows}

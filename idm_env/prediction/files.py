@@ -45,7 +45,6 @@ def predict_files(
     paths: Sequence[str | Path],
     out: str | Path,
     *,
-    baselines: bool = True,
     resume: bool = False,
     executor: Executor | None = None,
     on_progress: OnProgress | None = None,
@@ -63,19 +62,18 @@ def predict_files(
     """
     files = [Path(path) for path in paths]
     with storage.results(out, OUTPUT, files) as folder:
-        return _predict_files(files, folder.absolute(), baselines, resume, executor or Serial(), on_progress or silent)
+        return _predict_files(files, folder.absolute(), resume, executor or Serial(), on_progress or silent)
 
 
 def _predict_files(
-    files: Sequence[Path], out: Path, baselines: bool, resume: bool, executor: Executor, progress: OnProgress
+    files: Sequence[Path], out: Path, resume: bool, executor: Executor, progress: OnProgress
 ) -> dict[str, Any]:
-    parts = Parts(out / storage.UNFINISHED / "predict", _fingerprint(files, baselines), resume)
+    parts = Parts(out / storage.UNFINISHED / "predict", _fingerprint(files), resume)
     progress("counting", 0, 0, "scenarios")
     counts = [count(path) for path in files]
-    names = tuple(name for name in available() if baselines or name == OURS)
     everything = sum(counts)
     jobs = [
-        _Job(parts, number, path.absolute(), names, sum(counts[:number]), everything)
+        _Job(parts, number, path.absolute(), tuple(available()), sum(counts[:number]), everything)
         for number, path in enumerate(files) if not parts.done(number)
     ]  # fmt: skip
     before = everything - sum(counts[job.number] for job in jobs)
@@ -114,10 +112,10 @@ class _Job(NamedTuple):
         return self.path.name
 
 
-def _fingerprint(files: Sequence[Path], baselines: bool) -> str:
-    """Return a digest of names, sizes and times of the files, and of the settings."""
+def _fingerprint(files: Sequence[Path]) -> str:
+    """Return a digest of names, sizes and times of the files, as they are now."""
     stats = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) if p.exists() else p.name for p in files]
-    return storage.fingerprint(stats, baselines)
+    return storage.fingerprint(stats, True)
 
 
 def _predict_file(job: _Job, progress: OnProgress) -> None:

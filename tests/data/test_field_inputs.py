@@ -13,9 +13,11 @@ import numpy as np
 import polars as pl
 import pytest
 
+from idm_env.cli import refusals
 from idm_env.data import DataError, Trajectories, load
 from idm_env.data.load import files_of, read
 from idm_env.trajectories.spool import Spool
+from tests.commands import typed
 from tests.data.tables import kinds
 from tests.test_commands_read_alike import alike, tracks
 
@@ -562,3 +564,15 @@ def test_a_file_of_another_program_is_refused_with_how_to_export_it(ending: str,
     (tmp_path / f"a.{ending}").write_bytes(bytes(9))
     with pytest.raises(DataError, match=cure):
         load(tmp_path / f"a.{ending}")
+
+
+def test_reading_sumo_s_xml_shows_its_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    vehicles = "".join(
+        f'<vehicle id="{n}" pos="{STARTS[n] + x}" speed="{v}" lane="e_0"/>' for n in range(3) for x, v in [(0.0, 10.0)]
+    )
+    steps = "".join(f'<timestep time="{t}">{vehicles}</timestep>' for t in 0.1 * np.arange(200))
+    (tmp_path / "fcd.xml").write_text(f"<fcd-export>{steps}</fcd-export>")
+    monkeypatch.setattr(refusals, "LARGE_BYTES", 10_000)
+    size = (tmp_path / "fcd.xml").stat().st_size
+    done = typed("plot", tmp_path / "fcd.xml", "--out", tmp_path / "a.png")
+    assert done.returncode == 0 and f"reading {size}/{size} in " in done.stderr
