@@ -24,8 +24,8 @@ from idm_env.tasks import TASKS
 
 FOLDER = Path(__file__).resolve().parent / "tasks"
 SECONDS, WIDTH = 40.0, 600
-SHOWN, A_SECOND = 60, 6
-"""Seconds of an episode in a moving picture, one picture each, and how many pictures are shown in a second."""
+SHOWN, A_SECOND, LARGEST = 60, 6, 300_000
+"""Seconds of an episode in a moving picture, at most, one picture each; how many are shown in a second; bytes."""
 
 
 def pictures(folder: Path = FOLDER) -> list[Path]:
@@ -87,7 +87,10 @@ def moving(name: str, folder: Path = FOLDER) -> Path:
     palette.putpalette([part for each in colours for part in each])
     frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     path = folder / f"{name}.gif"
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=1000 // A_SECOND, loop=0, optimize=True)
+    path.unlink(missing_ok=True)
+    while not path.exists() or path.stat().st_size > LARGEST:
+        frames[0].save(path, save_all=True, append_images=frames[1:], duration=1000 // A_SECOND, loop=0, optimize=True)
+        del frames[-3:]
     return path
 
 
