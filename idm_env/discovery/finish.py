@@ -157,14 +157,16 @@ def _on_the_best(
     """
     best, now = bases.best_of(laws), judgement.beside(bases.best_of(laws))
     few = judgement.refusal is not None and judgement.refusal.reason is Reason.FEW_RUNS
+    # A law with all candidates as its drivers' own strengths leaves nothing to try.
+    search, own = evaluation.searching, best.model.catalogue
+    few |= not search.located and set(search.names) <= set(own.personal)
     if not best.against or few or not evaluation.adapt or now.of_all is None:
         return evaluation, decided, now, last
     if now.added and improves(compare(best.errors, now.of_all, evaluation.seed)):
         return evaluation, decided, now, last
     # In a law's loop there is room for all candidates.
-    room = evaluation.searching.base.catalogue
+    room = search.base.catalogue
     effects = tuple((best.model.catalogue.by_name | room.by_name).values())
-    own = best.model.catalogue
     catalogue = replace(room, effects=effects, base=best.law, personal=own.personal, without=own.without)
     model = Hypothesis(best.model.terms, catalogue)
     beyond, more = searched(model, "explain_law", best.errors)

@@ -83,6 +83,12 @@ def test_few_runs_cannot_tell() -> None:
     assert found.report["found"] == []
 
 
+def test_the_only_candidate_may_become_every_drivers_own_strength() -> None:
+    """A law with it is compared, and beyond that law nothing is left to try."""
+    stiff = synthetic.generate(5, runs=7, followers=1, seconds=60.0, effect="gap_stiffness", dt=0.2)[0]
+    assert discover(stiff, effects=["gap_stiffness"]).report["verdict"] == "named"
+
+
 def test_followers_are_counted_where_runs_are_few() -> None:
     found = discover(data("leader_acceleration", runs=5, followers=3), effects=FEW)
     assert [f["effect"] for f in found.report["found"]] == ["leader_acceleration"]
