@@ -116,14 +116,13 @@ def _stop(number: int, frame: object) -> NoReturn:
 
 
 @app.command()
-def demo(data: Path | None = None, out: Path = options.OUT, seed: Annotated[int, options.Limits(0, 1e9)] = 7) -> None:
+def demo(data: Path | None = None, columns: str | None = None, out: Path = options.OUT, seed: options.Seed = 7) -> None:
     """Generate platoons with a hidden effect, and find it: the whole of `explain` in half a minute.
 
     The data are written to OUT/platoon.csv first; nothing in them names the effect.
 
     Args:
         data: Your own file; default: generated data with a hidden effect.
-        seed: Seed of the generated data.
     """
     from idm_env.reports.undecided import EXPLAINED
 
@@ -141,7 +140,7 @@ def demo(data: Path | None = None, out: Path = options.OUT, seed: Annotated[int,
             measured = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
             storage.write_csv(path, trajectories.table.select(measured))
             console.print(f"Ten runs of a leader and three followers: {path}", soft_wrap=True)
-        result, models = explain_one(path, out, Question(), on_progress=report)
+        result, models = explain_one(path, out, Question(columns=columns if data else None), on_progress=report)
     answers.explained(result, models, out)
 
 

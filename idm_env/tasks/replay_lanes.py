@@ -140,7 +140,7 @@ class ReplayLanesTask(ReplayTask, LanesTask):
         assert lanes is not None
         nearest = self.pick(torch.minimum(state.gap, self._behind(state)))[row].detach()
         vehicle = self.agents[int(nearest.argmin()) if agent is None else agent]
-        if float(state.gap[row, vehicle]) > 0.0:
+        if float(state.gap[row, vehicle].detach()) > 0.0:
             vehicle = int(lanes.follower[row, vehicle])
         seconds, leader = float(state.step[row]) * self.simulator.dt, int(lanes.leader[row, vehicle])
-        return contact(self.vehicle_ids, self.agents, vehicle, float(state.gap[row, vehicle]), seconds, leader)
+        return contact(self.vehicle_ids, self.agents, vehicle, float(state.gap[row, vehicle].detach()), seconds, leader)

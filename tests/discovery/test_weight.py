@@ -61,4 +61,4 @@ def test_long_clean_records_of_unlike_drivers_speak_for_themselves() -> None:
 
 def test_the_weight_is_told() -> None:
     told = words.weight(Weight(50.0, (5.0, 50.0), (5.04, 3.82)))
-    assert "errors within 50 s count as one (tried: 5 s 5.04 m, 50 s 3.82 m)" in told
+    assert "strength chosen by validation, before any effect was tested: 50 s (3.82 m)" in told

@@ -168,7 +168,9 @@ def test_agents_of_trips_come_and_go():
     assert last is not None
 
 
-@pytest.mark.parametrize("actions", [1.0, True, b"1", [0.0], np.zeros(1), {0.0}, lambda: 1, torch.zeros(1)], ids=repr)
+@pytest.mark.parametrize(
+    "actions", [1.0, True, b"1", [0.0], np.zeros(1), {0.0}, lambda: 1, torch.zeros(1)], ids=lambda x: type(x).__name__
+)
 def test_actions_that_are_no_mapping_are_one_line(actions):
     """Told by name before a step is done, as they are of a single environment."""
     faces = parallel_env(task="follow")

@@ -142,7 +142,7 @@ def test_a_road_goes_on(ends: Any, words: str) -> None:
         Lanes(2, length=500.0, ends=ends)
 
 
-@pytest.mark.parametrize("value", [math.inf, True, 1j, HUGE, object(), len], ids=str)
+@pytest.mark.parametrize("value", [math.inf, True, 1j, HUGE, object(), len], ids=lambda x: type(x).__name__)
 @pytest.mark.parametrize("option", ["data", "runs", "model"])
 def test_what_a_replay_is_of_has_a_type(option: str, value: Any) -> None:
     """Told by name and in one line; runs of no file are refused, too."""
