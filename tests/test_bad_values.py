@@ -344,7 +344,7 @@ def test_lack_of_memory_is_a_sentence(
     assert capsys.readouterr().err == f"error: this needs more memory than there is. {cure}\n"
     env = gym.make_vec("DiffIDM-v0", num_envs=3, output="torch", warmup=0)
     env.reset(seed=0)
-    monkeypatch.setattr(Batch, "_stepped", lacks)
+    monkeypatch.setattr(Batch, "_once", lacks)
     monkeypatch.setattr(window, "compiled", lacks)
     for act in (env.step, lambda _: env.unroll(torch.tanh, 2)):
         with pytest.raises(MemoryError, match=r"^num_envs = 3 of \d+ vehicles need more memory than cpu has"):

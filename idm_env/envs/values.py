@@ -157,13 +157,10 @@ class Values:
         """
         plan = self.plan((action is None, live is None), tuple(normals or ()))
         bound = plan.of(self.layout, params)
-        command = action.detach().numpy() if isinstance(action, Tensor) else action
-        if command is not None and not command.flags.c_contiguous:
-            command = np.ascontiguousarray(command)  # loops read row after row
         if self.past.slots:
             self.past.room()
         past = self.past
-        moment = Moment(self._clock, command, live, normals, at, past.numbers, past.newest, bound, self.whole)
+        moment = Moment(self._clock, _in_rows(action), live, normals, at, past.numbers, past.newest, bound, self.whole)
         outputs: dict[str, Any]
         if self._graph and torch.is_grad_enabled() and self._differentiated(action, bound):
             outputs = self._noted(plan, moment, action, bound)
@@ -183,8 +180,8 @@ class Values:
         return outputs
 
     def hold(
-        self, action: Array | None, live: Array | None, normals: Mapping[str, Array] | None, at: int, params: Params,
-        steps: int,
+        self, action: Array | Tensor | None, live: Array | None, normals: Mapping[str, Array] | None, at: int,
+        params: Params, steps: int,
     ) -> tuple[dict[str, Array], int]:  # fmt: skip
         """Advance all rows under one action by some steps at once, or until somebody's episode is over; no graph.
 
@@ -192,13 +189,13 @@ class Values:
         were done: at least one.
         """
         plan, past = self.plan((action is None, live is None), tuple(normals or ())), self.past
-        bound = plan.of(self.layout, params)
+        bound, command = plan.of(self.layout, params), _in_rows(action)
         steps = min(steps, past.room()) if past.slots else steps
         (worlds, outputs, _), done, whole = bound.together, 0, list[Array | None]()
         now, clock, lanes = self.blocks, self._clock, self.whole
         while done < steps:
             count = min(steps - done, 1 + plan.until(clock + 1))
-            moment = Moment(clock, action, live, normals, at + done, past.numbers, past.newest - done, bound, lanes)
+            moment = Moment(clock, command, live, normals, at + done, past.numbers, past.newest - done, bound, lanes)
             plan.run_together(moment, now, done, count)
             whole += [None] * count if moment.crossing is None else moment.crossing.later
             done += count
@@ -356,6 +353,12 @@ def _world(
         leaves |= dict(zip(WHOLE, torch.from_numpy(whole).view(-1, *like.state.speed.shape), strict=False))
     state, episode = world_of(leaves, like)
     return EnvState(state if past is None else state._replace(memory={**state.memory, PAST: past}), episode)
+
+
+def _in_rows(action: Array | Tensor | None) -> Array | None:
+    """Return an action as an array that loops read row after row."""
+    array = action.detach().numpy() if isinstance(action, Tensor) else action
+    return None if array is None else np.ascontiguousarray(array)
 
 
 def _block(world: EnvState, names: Sequence[str]) -> Tensor:
