@@ -133,10 +133,10 @@ def check(effects: Iterable[HasParameters], params: Params) -> None:
     A parameter's null is always accepted, also where it lies outside the bounds of the search.
     """
     effects = tuple(effects)
-    declared = catalogue(effects)
+    declared, names = catalogue(effects), {e.name for e in effects}
     refuse_incomplete((), params)
     for effect, values in params.items():
-        if effect not in (names := {e.name for e in effects}):
+        if effect not in names:
             raise ValueError(f"unknown effect {shown(effect)} in parameters.{nearest(effect, names)}")
         for full in (f"{effect}.{name}" for name in values):
             if full not in declared:

@@ -103,14 +103,8 @@ def _rewritten(path: Path, files: ExitStack) -> Iterable[str] | None:
     comma = max(",;\t", key=first.count)
     units = [cell.strip().strip("[]()") for cell in lines[1].split(comma)] if lines[1:] else []
     has_units = sum(map(bool, units)) > 1 and {*units} <= UNIT_NAMES
-    if not (
-        odd
-        or has_units
-        or numbers
-        or trailing
-        or encoding != "utf-8"
-        or path.name.lower().endswith((".zip", ".txt.gz"))
-    ):
+    odd |= encoding != "utf-8" or path.name.lower().endswith((".zip", ".txt.gz"))
+    if not (odd or has_units or numbers or trailing):
         return None
     lines = (head + read_whole(file, path.name)).decode(encoding, "replace").removeprefix("\ufeff").splitlines()
     mark = lines.pop(0)[4:] if first.lower().startswith("sep=") else ""

@@ -155,12 +155,13 @@ def _on_the_best(
     It has to hold by the rules of every addition, against its law, and against the law or IDM with what was added. On a
     law that errs more than IDM with what was added, nothing is sought.
     """
-    best, now = bases.best_of(laws), judgement.beside(bases.best_of(laws))
+    best = bases.best_of(laws)
+    now = judgement.beside(best)
     few = judgement.refusal is not None and judgement.refusal.reason is Reason.FEW_RUNS
     # A law with all candidates as its drivers' own strengths leaves nothing to try.
     search, own = evaluation.searching, best.model.catalogue
-    few |= not search.located and set(search.names) <= set(own.personal)
-    if not best.against or few or not evaluation.adapt or now.of_all is None:
+    has_candidates = search.located or not set(search.names) <= set(own.personal)
+    if not best.against or few or not has_candidates or not evaluation.adapt or now.of_all is None:
         return evaluation, decided, now, last
     if now.added and improves(compare(best.errors, now.of_all, evaluation.seed)):
         return evaluation, decided, now, last

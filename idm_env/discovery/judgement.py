@@ -185,6 +185,11 @@ class Evaluation:
         return crossed.folds_of(self.records.runs, () if self.test is None else self.test.runs, self.seed)
 
     @cached_property
+    def _null_values(self) -> np.ndarray:
+        """φ of the null [folds, Q] without the runs of each fold, which every law takes as it is."""
+        return crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
+
+    @cached_property
     def of_null(self) -> Calibration:
         """Calibration of the null, with errors that are ``known`` already."""
         if self.known is None or self.null.model.terms != self.searching.base.terms:
@@ -211,8 +216,7 @@ class Evaluation:
     def of_law(self, model: Hypothesis) -> judge.Judged:
         """Return the errors of another law, calibrated and judged as the null."""
         if self.adapt:
-            values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
-            return crossed.crossed(self.records, model, values, self._fold)
+            return crossed.crossed(self.records, model, self._null_values, self._fold)
         errors = self.calibrated(model, self.null.values)[1]
         assert errors is not None
         return errors
@@ -221,8 +225,7 @@ class Evaluation:
         """Return the errors of a law for the drivers of the records ``wanted`` [records], its population."""
         records = self.records.some(wanted)
         fold = self._fold[[self.records.runs.index(run) for run in records.runs]]
-        values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
-        return crossed.crossed(records, model, values, fold)
+        return crossed.crossed(records, model, self._null_values, fold)
 
     def calibrated_among(self, model: Hypothesis, wanted: np.ndarray) -> Solution:
         """Return the parameters by a law of the drivers of records ``wanted`` [records], its population."""
