@@ -5,8 +5,6 @@ Gymnasium ids ``DiffIDM-v0`` and one more for each task (``DiffIDM/Ring-v0``). G
 plug-ins: a process that has not imported this package, such as a remote worker, finds them as ``"idm_env:DiffIDM-v0"``.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

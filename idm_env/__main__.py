@@ -1,7 +1,5 @@
 """``python -m idm_env`` and the command ``idm-env``."""
 
-from __future__ import annotations
-
 import signal
 import sys
 

@@ -4,8 +4,6 @@ A simulator is built below the compiled loops and does not know them. ``idm_env`
 registers its environments: by text, so that nothing heavy is imported before it is used.
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Which extra gives what the core does without: said in one line wherever it is missing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

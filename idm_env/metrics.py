@@ -3,8 +3,6 @@
 Shapes: rates are elementwise over ``[..., n]``; sums over time run along the first dimension.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -21,8 +21,6 @@ can tell a fitted from a held-out figure.
 Unknown keys are errors with a suggestion, in one line.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import logging
 import math

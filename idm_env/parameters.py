@@ -7,8 +7,6 @@ tensors (``defaults``, ``sample``, ``null``), moves tensors in and out of their 
 Shapes: every parameter is a scalar ``[]`` or one number per vehicle ``[..., n]``, in the unit it declares.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Mapping

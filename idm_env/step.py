@@ -6,8 +6,6 @@ where they came from, and prints compiled code from that.
 Shapes: what belongs to vehicles is ``[..., n]``, in SI units; parameters are scalars or ``[..., n]``.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import zlib
 from collections.abc import Callable, Iterable, Mapping

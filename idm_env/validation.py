@@ -1,7 +1,5 @@
 """Checks of users' values, numbers first: one line that names the value, the rule and the cure."""
 
-from __future__ import annotations
-
 import difflib
 import math
 import numbers

@@ -1,7 +1,5 @@
 """The command line: commands, refusals before anything slow is imported, and a check of this machine."""
 
-from __future__ import annotations
-
 import os
 
 

@@ -1,7 +1,5 @@
 """Printed results of commands: tables on stdout, sentences on stderr."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

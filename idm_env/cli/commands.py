@@ -1,7 +1,5 @@
 """The command ``idm-env``: thin, one function per verb, in the order of the help; errors in one line."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import os

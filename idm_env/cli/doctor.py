@@ -1,7 +1,5 @@
 """A check of this machine, each fault with its cure: ``idm-env doctor``."""
 
-from __future__ import annotations
-
 import os
 import platform
 import re

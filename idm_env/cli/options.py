@@ -1,7 +1,5 @@
 """Options of commands: every one stands here once, those that go together as fields of one dataclass."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import inspect

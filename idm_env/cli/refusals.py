@@ -1,7 +1,5 @@
 """Refusals of a command before anything slow is imported: words of its options, and the heads of its files."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

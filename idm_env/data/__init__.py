@@ -1,7 +1,5 @@
 """Measured traffic: files to checked trajectories, trajectories to episodes of one driver behind one leader."""
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

@@ -1,7 +1,5 @@
 """First pass over a table: types, identifiers, values that are not finite, order and repeats of time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import polars as pl

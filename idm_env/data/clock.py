@@ -1,7 +1,5 @@
 """Put every vehicle of a run on one regular clock; short holes are filled, long ones split the track later."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -3,8 +3,6 @@
 Shapes: a column of one vehicle is ``[samples]``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 

@@ -4,8 +4,6 @@ Everything behind this (leaders, gaps, the simulator) has positions that rise al
 is refused.
 """
 
-from __future__ import annotations
-
 import polars as pl
 
 from idm_env.data.clean import NAMES

@@ -14,8 +14,6 @@ I-24 MOTION   Gloudemans et al. 2023: JSON, one document per vehicle with arrays
 ============  ==========================================================================================================
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

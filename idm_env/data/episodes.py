@@ -1,7 +1,5 @@
 """Cuts trajectories into episodes: stretches in which one driver follows one leader that is measured all along."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 

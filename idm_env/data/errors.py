@@ -1,7 +1,5 @@
 """Errors of the data package, and the repairs that it counts."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

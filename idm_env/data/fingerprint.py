@@ -1,7 +1,5 @@
 """Marks of fitted drivers: their places at whole seconds, whatever the file is called or how it is cut."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator
 from typing import Any

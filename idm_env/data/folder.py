@@ -1,7 +1,5 @@
 """A partitioned folder of parquet files, larger than memory: which runs it has, and some of them at a time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Base: a [1 − (v/v0)⁴ − (s*/s)²] with s* = s0 + max(0, v T + v Δv / (2 �
 effect below changes one thing in it; sources are named in `idm_env.effects`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Several files as one data set: a copy with the rows of all, in which each file is a run, or has runs of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Leaders and gaps: leaders derived or checked, gaps measured or taken from positions."""
 
-from __future__ import annotations
-
 import polars as pl
 
 from idm_env.data import units

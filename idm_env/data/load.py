@@ -1,7 +1,5 @@
 """Read a file of measured vehicles, whatever its layout, into checked trajectories."""
 
-from __future__ import annotations
-
 import glob
 import io
 import re

@@ -1,7 +1,5 @@
 """Columns under names and units of their own: ``position_m=x[ft]``, and the best guess at a header that is unknown."""
 
-from __future__ import annotations
-
 import math
 import re
 import shlex

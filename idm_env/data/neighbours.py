@@ -1,7 +1,5 @@
 """For every row of a table, the rows of the vehicles around it at the same time: vectorised over the whole table."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ separators, and identifiers used again in another period) are read. Local_Y is t
 Source: U.S. Federal Highway Administration, Next Generation Simulation, data dictionary of the trajectory files.
 """
 
-from __future__ import annotations
-
 import polars as pl
 
 from idm_env.data.clean import exact

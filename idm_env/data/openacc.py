@@ -6,8 +6,6 @@ in m between places n and n + 1. Source: Makridis, Mattas, Anesiadou, Ciuffo 202
 the notes published with the data by the European Commission's Joint Research Centre.
 """
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -4,8 +4,6 @@
 enough, and any of the follower's position and speed: the way is then the trapezoidal integral of the speed.
 """
 
-from __future__ import annotations
-
 import polars as pl
 
 from idm_env.data.clean import parsed

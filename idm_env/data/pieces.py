@@ -1,7 +1,5 @@
 """Cuts one long recording into runs of equal duration, each driver in one of them only."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

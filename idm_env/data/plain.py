@@ -4,8 +4,6 @@ SUMO's ``--fcd-output`` and Vissim's vehicle records have positions along an edg
 next one: each is a run. Positions are of front bumpers (m); SUMO's speeds are in m/s, Vissim's in km/h.
 """
 
-from __future__ import annotations
-
 import atexit
 import gzip
 import re

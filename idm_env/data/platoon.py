@@ -4,8 +4,6 @@ Heun's second order at a step far below that of the data keeps errors of integra
 take for an effect, which a first-order step at 0.1 s does not.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 Of 1.57 million rows of six measured sets none moves faster than 70 m/s, and none falls by a metre.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field
 from itertools import count

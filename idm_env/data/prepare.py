@@ -1,7 +1,5 @@
 """From any table with the tidy columns to the checked one on a regular clock, every change on the way counted."""
 
-from __future__ import annotations
-
 import polars as pl
 
 from idm_env.data import clean, clock, directions, leaders, plausible, schema, speeds, units

@@ -6,8 +6,6 @@ shifts the one behind by as much as it shifts itself, the other way: shifts of n
 drivers who delay or look ahead are not. What a second leader foretells is a shift, too, unless it is among the terms.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scenarios, whatever file they come from: agents over time, lanes, stop signs and signals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -3,8 +3,6 @@
 One row per vehicle and time. Positions are front bumpers along the lane, gaps are bumper to bumper, units are SI.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

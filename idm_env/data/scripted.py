@@ -1,7 +1,5 @@
 """Inputs of synthetic platoons: leaders that stop, go and run away, a queue beside them, and drivers' noise."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter

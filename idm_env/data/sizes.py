@@ -3,8 +3,6 @@
 A trailer of gzip tells a size modulo 2³² of its last member only, so bytes are counted as they are unpacked.
 """
 
-from __future__ import annotations
-
 import gzip
 import os
 from pathlib import Path

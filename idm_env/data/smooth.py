@@ -5,8 +5,6 @@ as differences of x. The jerk's spectral density q is that of driving, so that t
 A banded system is solved anew for every record: nothing is cached, and nothing is rounded.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

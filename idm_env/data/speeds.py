@@ -1,7 +1,5 @@
 """Complete what a file leaves open: positions unwrapped on a ring, lengths assumed, speeds estimated; each counted."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 

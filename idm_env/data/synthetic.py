@@ -1,7 +1,5 @@
 """Data with a known truth: platoons of heterogeneous drivers, hidden effects, drivers' and measurement noise."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 

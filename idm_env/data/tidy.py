@@ -1,7 +1,5 @@
 """Reader of tables that are tidy already: csv, csv.gz or parquet with the columns of `idm_env.data.schema`."""
 
-from __future__ import annotations
-
 import polars as pl
 
 from idm_env.data.errors import DataError, Repair, listed

@@ -4,8 +4,6 @@ Positions are of centres, along the road; Space_Gap is from bumper to bumper, Sp
 Source: Zhou, Ma, Liang, Li, Qu 2024, A unified longitudinal trajectory dataset for automated vehicle, Scientific Data.
 """
 
-from __future__ import annotations
-
 import polars as pl
 
 from idm_env.data.errors import Repair, missing_column

@@ -1,7 +1,5 @@
 """Does the table mean metres, seconds and m/s? Feet, km/h, milliseconds and frames are named, never guessed away."""
 
-from __future__ import annotations
-
 import math
 
 import polars as pl

@@ -4,8 +4,6 @@ JSON is the layout of Nocturne and GPUDrive: ``objects`` with position, heading,
 with geometry by type, ``metadata.tracks_to_predict``. TFRecord is the official ``scenario.proto`` (``womd_record.py``).
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

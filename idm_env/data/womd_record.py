@@ -4,8 +4,6 @@ Only the fields that prediction needs are declared; protobuf skips all others. F
 ``scenario.proto`` and ``map.proto`` of the Waymo Open Dataset.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from functools import lru_cache

@@ -3,8 +3,6 @@
 Needs the extras ``data`` and ``kernels``.
 """
 
-from __future__ import annotations
-
 from idm_env.extras import needed
 
 with needed("explaining"):

@@ -3,8 +3,6 @@
 One of them is there once more, with the strengths of effects that are each driver's own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import NamedTuple

@@ -4,8 +4,6 @@ Whatever is calibrated more carefully looks better. So every model has its own p
 of that population, both from closed-loop simulation of the runs that fit, by one procedure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ None of these needs a candidate. They stand beside the errors before and after, 
 and that a refitted driver does not have is no model's fault.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ there. In free simulation it shows. θ of every driver comes from every other bl
 blocks between are scored.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Is an error on the test set better, the same or worse, and how sure is that: bootstrap over followers or runs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

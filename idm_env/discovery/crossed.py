@@ -3,8 +3,6 @@
 A quarter of the runs, kept back once, leaves a handful of followers to decide, and one of them can. Here all count.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -2,8 +2,6 @@
 much better is the corrected model on runs that had no part in it.
 """  # noqa: D205
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """From what a search decided to a discovery: judged on the test set, beside other laws, told, and saved as models."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property

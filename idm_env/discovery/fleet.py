@@ -1,7 +1,5 @@
 """Drivers of several kinds in one file: which law each of them follows, told by a column or by their own errors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """A finding without a name, as a file with an effect: its equation, its parameters with intervals, its null."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import fill

@@ -5,8 +5,6 @@ correction by a driver's last errors follows his drift; a smooth function of the
 an effect could add: structure, named or not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

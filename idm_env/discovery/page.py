@@ -3,8 +3,6 @@
 Its words stand in ``report.html``.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

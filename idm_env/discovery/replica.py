@@ -5,8 +5,6 @@ speed grow in windows of 5 s. Every follower drives behind his measured leader. 
 tells of errors in them is what noise alone does: the scene has felt it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 A field whose default is None is left out of the file where it is None.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

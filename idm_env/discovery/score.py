@@ -1,7 +1,5 @@
 """Scores on held-out runs, and the test over the whole list of candidates."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``explain`` over one data set or over many: one folder of results each, and a table of all verdicts."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass

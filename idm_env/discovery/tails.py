@@ -1,7 +1,5 @@
 """Where errors are: noise of drivers is everywhere, an effect is somewhere."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Terms that show in free simulation: added one by one by held-out score, all fitted at once, and taken back again."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

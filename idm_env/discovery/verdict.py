@@ -1,7 +1,5 @@
 """What a discovery concludes: enums that decide; sentences are made from them in ``words``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum

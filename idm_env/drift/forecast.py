@@ -3,8 +3,6 @@
 Shapes: levels are ``[T, rows, p + k]``, drawn futures ``[steps, draws, starts]``.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

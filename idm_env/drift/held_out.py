@@ -3,8 +3,6 @@
 Shapes: places of drivers are ``[k]``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The command ``drift``: a file of measured traffic in, how its drivers drift and drivers who do so out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

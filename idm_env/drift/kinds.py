@@ -1,7 +1,5 @@
 """What sort of drift it is: every sort estimated on the same records, against drivers who do not drift."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -3,15 +3,13 @@
 ``ALL`` has all by name, ``CANDIDATES`` are what discovery tries. ``register`` enters effects of one's own.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from idm_env.effects.actions import *
 from idm_env.effects.adaptation import *
-from idm_env.effects.base import CarFollowing, Effect
+from idm_env.effects.base import CarFollowing, Effect, hint_of
 from idm_env.effects.bases import *
 from idm_env.effects.free import *
 from idm_env.effects.idm import *
@@ -107,7 +105,7 @@ def make(kind: str, **choices: object) -> Effect:
         if choice not in choice_types:
             raise ValueError(f"effect '{kind}' has no choice {shown(choice)}.{nearest(choice, choice_types)}")
         if not _fits(value, choice_types[choice]):
-            hint = cls.__dataclass_fields__[choice].type
+            hint = hint_of(cls.__dataclass_fields__[choice])
             raise ValueError(f"effect '{kind}': {choice} = {shown(value)} must be of the kind {hint}, and finite.")
     return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in choices.items()})  # type: ignore[arg-type]
 

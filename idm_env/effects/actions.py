@@ -1,7 +1,5 @@
 """Vehicles that somebody else moves: an agent's command, and a replayed record."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """How the driver's own parameters change: with speed, memory, place and time (hook ``adapt``)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

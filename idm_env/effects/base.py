@@ -3,11 +3,10 @@
 Shapes: what belongs to vehicles is ``[..., n]``, in SI units; parameters are scalars or ``[..., n]``.
 """
 
-from __future__ import annotations
-
 import math
 import re
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import Field, dataclass, fields, is_dataclass
+from inspect import formatannotation
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, get_args
 
@@ -33,6 +32,12 @@ Neighbour = Literal["leader", "second leader", "vehicle behind", "vehicle in an 
 
 NEEDED = frozenset({"second_leader", "behind", "merger", "lane"})
 """Neighbours that a scene has where an effect ``needs`` them."""
+
+
+def hint_of(field: Field[Any]) -> str:
+    """Return the type that a choice declares, as it is written, whether its file keeps annotations as texts or not."""
+    return field.type if isinstance(field.type, str) else formatannotation(field.type)
+
 
 P = dict[str, Tensor]
 """The parameters of one effect: name → tensor."""
@@ -120,8 +125,9 @@ class Effect:
         """Return an effect. ValueError, in one line, for a number, truth value or text that its choices do not take."""
         values = dict(zip(getattr(cls, "__match_args__", ()), choices, strict=False)) | named
         for field in fields(cls) if is_dataclass(cls) else ():
-            kind, value = str(field.type).removesuffix(" | None"), values.get(field.name, field.default)
-            if kind not in CHOICES or value is field.default or (value is None and kind != field.type):
+            hint, value = hint_of(field), values.get(field.name, field.default)
+            kind = hint.removesuffix(" | None")
+            if kind not in CHOICES or value is field.default or (value is None and kind != hint):
                 continue
             if isinstance(value, bool) != (kind == "bool") or not isinstance(value, CHOICES[kind]) or value != value:
                 raise ValueError(f"{cls.kind}.{field.name} = {shown(value)} must be of type {kind}, and no NaN.")

@@ -4,8 +4,6 @@ Each is one term with a driver of its own, so that every other effect acts on it
 gap, a desired speed or a smallest gap changes what these laws read. All parameters are positive.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

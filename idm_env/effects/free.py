@@ -1,7 +1,5 @@
 """Curves over a feature of the scene: what to add when nothing in the catalogue has a name for it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

@@ -3,8 +3,6 @@
 Shapes: everything is elementwise over vehicles, ``[..., n]``, in SI units.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

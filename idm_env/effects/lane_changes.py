@@ -1,7 +1,5 @@
 """Wishes for another lane (hook ``change``): MOBIL, lanes that end, and an agent's command."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Limits of the vehicle: asymmetry, action points, power, lag, brakes and tyres (hook ``limit``, chained by rank)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Where the neighbour is missing each of these is exactly absent.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

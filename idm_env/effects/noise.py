@@ -9,8 +9,6 @@ an Ornstein–Uhlenbeck process n of unit variance with the memory time τ, by i
 It begins at its mean, 0, unless ``Simulator.state`` is given a seed, and what an effect does with it is null at σ = 0.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """Perceptions of the driver: delayed, blurred, biased or imagined scenes (hook ``perceive``)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """How fast drivers want to go at a place: a profile that the traffic shows, and bends that are measured (``adapt``)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

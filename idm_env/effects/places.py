@@ -3,8 +3,6 @@
 Shapes: the result of a coordinate ``[..., n]`` (m or s) is ``[..., n]``, without a unit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """The publications that effects are taken from, by name and year, as ``idm-env effects --cite`` prints them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

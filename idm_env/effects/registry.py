@@ -1,7 +1,5 @@
 """An open catalogue: effects of one's own entered for this process, and where their classes live."""
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Rules of the road: speed limits, closed lanes, signals, and the lanes on which drivers leave."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Physics of the road and the air: slopes and drag (hook ``accelerate``, seeing the true scene)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

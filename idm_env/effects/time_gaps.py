@@ -1,7 +1,5 @@
 """How a driver's desired gap varies: with speed, what the leader does and did, habit, the gap (hook ``adapt``)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

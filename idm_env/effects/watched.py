@@ -3,8 +3,6 @@
 The package's effects are not watched: the laws of ``tests/laws`` hold them to the same.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Adam through the simulator, as in the paper: reverse-mode gradients, parameters behind bijections."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -13,8 +13,6 @@ would outweigh all others.
 Shapes: what belongs to decisions is ``[decisions]`` or ``[decisions, 2]`` (left, right), θ is ``[p]``.
 """
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """How well a model reproduces drivers: errors per episode."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Calibration: from episodes to fitted parameters with standard errors, interruptible and resumable."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

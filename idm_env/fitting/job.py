@@ -1,7 +1,5 @@
 """The commands ``fit`` and ``simulate``: a file of measured traffic in, a folder of results out."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command ``fit --lane-changes``: a file with lanes in, MOBIL's parameters and held-out likelihoods out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Options of ``fit`` and ``simulate``: how a file is read, and how a model is fitted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

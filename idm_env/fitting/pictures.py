@@ -1,7 +1,5 @@
 """Pictures of fits: measured against simulated drivers, and how fitted parameters spread."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ Parts know nothing of each other: a part's drivers start from the pooled optimum
 bytes wherever and how often it is done.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fitted drivers as SUMO's vehicle types: an additional file with one ``vType`` per driver."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from xml.sax.saxutils import quoteattr

@@ -1,7 +1,5 @@
 """Standard errors of fitted parameters, and which of them the data do not tell."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any, NamedTuple
 

@@ -5,8 +5,6 @@ so that the same part gives the same bytes anywhere, and may be done again after
 files that a part writes in one piece (``parts.Parts``); what comes back through ``map`` is small.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import pickle

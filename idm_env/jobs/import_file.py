@@ -1,7 +1,5 @@
 """A file, or a text, as a module: run once per process."""
 
-from __future__ import annotations
-
 import importlib.abc
 import importlib.util
 import sys

@@ -1,7 +1,5 @@
 """Finished parts of a long run on disk, so that an interrupted run goes on where it was."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Trust in code that files name: a file with the place of a class names its author's code, run only if trusted."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

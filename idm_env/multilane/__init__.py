@@ -1,7 +1,5 @@
 """Several lanes: trips, incentives and lane changes, as functions of a state that run before a step."""
 
-from __future__ import annotations
-
 from idm_env.multilane.demand import turnover
 from idm_env.multilane.lane_change import decided
 from idm_env.step import CarFollowingStep

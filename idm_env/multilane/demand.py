@@ -6,8 +6,6 @@ moved: at any time ``due = inside + left + queued``, and a queue that grows is a
 Shapes: what belongs to slots is ``[..., n]``; times in s, positions in m.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import NamedTuple

@@ -5,8 +5,6 @@ executes. Hypothetical pairs are answered by the simulator's own effects, percep
 limits the vehicle: it is the driver who decides. He judges by what he sees now, whatever his delay.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable
 from typing import Any

@@ -3,8 +3,6 @@
 Choices are frozen: gradients flow through gaps alone, and are exact where no choice flips.
 """
 
-from __future__ import annotations
-
 import torch
 
 from idm_env.multilane.incentives import lane_scene, seen_merging, wished

@@ -6,8 +6,6 @@ covariance, from which drivers are drawn, and the evidence of the second tells h
 second does not tell stays as spread in the futures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Scenario files in, predictions with metrics, pictures and a report out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Without lanes: road users who keep their velocity, and those who keep their motion with a spread."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

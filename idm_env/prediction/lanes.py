@@ -3,8 +3,6 @@
 Shapes: points are ``[k, 2]`` (m), arc lengths and headings ``[k]`` (m, rad).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -8,8 +8,6 @@ positive, only one per agent, and all others are false positives. Of the eight s
 one, and among equal confidences false positives come first, as in the benchmark's own code (``motion_metrics.cc``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

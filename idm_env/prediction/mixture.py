@@ -6,8 +6,6 @@ benchmark's box), so with p_ic the share of way c's futures that hit agent i and
 (``benchmarks/prediction.py``). Agents that stand are counted apart from those that move, and no kind lends to another.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 WAYS = ("keeps", "loose", "lane")

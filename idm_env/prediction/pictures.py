@@ -1,7 +1,5 @@
 """The scene from above: lanes, everybody, and of one agent its history, futures and true path."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon

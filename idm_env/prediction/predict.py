@@ -1,7 +1,5 @@
 """Futures of the agents of a scenario: several by fitted drivers on routes, and single ones to compare them with."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 

@@ -1,7 +1,5 @@
 """The page of a run of predictions: metrics over all agents, by scene and by kind, and scenes from above."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any

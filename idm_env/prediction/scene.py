@@ -1,7 +1,5 @@
 """A scenario as drivers see it: their routes, the leaders on them, stop lines, and the leaders' futures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 

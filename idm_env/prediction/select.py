@@ -1,7 +1,5 @@
 """From many weighted futures to six: those that leave the least expected miss and distance, with their chances."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from idm_env.prediction.metrics import HORIZONS, MISS_M, at_two_hertz, speed_scale

@@ -1,7 +1,5 @@
 """Where a route asks for a stop: stop signs and red lights, as standing leaders at the stop line."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Space-time diagrams, one panel per run and lane, and the colours of speeds that all pictures share."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Sequence

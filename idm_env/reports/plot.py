@@ -1,7 +1,5 @@
 """Pictures for teaching: the fundamental diagram and the moving picture of traffic, from a rollout or a table."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

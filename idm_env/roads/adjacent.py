@@ -6,8 +6,6 @@ What stands here is arithmetic of one vehicle and its neighbours. ``roads.linked
 Shapes: everything is of one vehicle, ``[]`` in a recording and ``[..., n]`` in tensors, in SI units.
 """
 
-from __future__ import annotations
-
 import abc
 from typing import Any, ClassVar, NamedTuple
 

@@ -5,8 +5,6 @@ order of their lanes. On a ring each lane has a *halo* of copies at either end, 
 its ends does not reach the vehicles themselves within those steps.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

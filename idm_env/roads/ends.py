@@ -3,8 +3,6 @@
 Shapes: what belongs to vehicles is ``[..., n]``, in SI units.
 """
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Sequence
 

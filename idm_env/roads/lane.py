@@ -1,7 +1,5 @@
 """An open lane: vehicle 0 is in front and has nobody ahead."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -4,8 +4,6 @@ Between two lane changes the order within a lane does not change, so gaps stay s
 only where somebody changes, comes or goes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -3,8 +3,6 @@
 Shapes: what belongs to vehicles is ``[..., n]``, places are in m.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, get_args
 

@@ -3,8 +3,6 @@
 Shapes: what belongs to vehicles is ``[..., n]``; slots are indices into the last dimension, laps are counts.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 

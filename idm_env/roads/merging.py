@@ -3,8 +3,6 @@
 Shapes: what belongs to drivers is ``[..., n]``; slots are indices into the last dimension.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """A closed ring: the leader of vehicle 0 is the last vehicle."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Tasks: what is to be achieved in traffic, as pure functions over the simulator."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any

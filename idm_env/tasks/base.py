@@ -5,8 +5,6 @@ through a rollout call it directly. Everything random comes in: as keys (``Draw`
 step. A crash ends an episode, and with it what was in store: see ``idm_env.tasks.crash``.
 """
 
-from __future__ import annotations
-
 import abc
 import math
 import warnings

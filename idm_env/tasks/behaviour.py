@@ -1,7 +1,5 @@
 """How drivers behave in a task: its own effects and parameters, changed by keyword or replaced by a saved model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

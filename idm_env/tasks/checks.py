@@ -1,7 +1,5 @@
 """Checks of tasks' keyword arguments: one line that names the value, the rule and the cure."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -116,7 +114,7 @@ def in_ranges(task: Any) -> None:
         value = getattr(task, field.name)
         if isinstance(field.default, bool) and not isinstance(value, bool):
             raise ValueError(f"{field.name} = {shown(value)} must be True or False.")
-        if field.type == "str | None" and not isinstance(value, str | PathLike | None):
+        if field.type in ("str | None", str | None) and not isinstance(value, str | PathLike | None):
             raise ValueError(f"{field.name} = {shown(value)} must be a text.")
         if field.name in by_name and not (value is None and field.default is None):
             by_name[field.name].check(field.name, value)

@@ -9,8 +9,6 @@ Rewards that can be negative are a reason to crash. Under one in [low, high] wit
 that of every survival. Algorithms that learn values should then normalise rewards (``VecNormalize``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

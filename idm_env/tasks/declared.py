@@ -1,7 +1,5 @@
 """One of a catalogue: a name of it, an object of one's own, or the place of one in a file that is trusted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import TypeVar
 

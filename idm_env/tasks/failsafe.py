@@ -1,7 +1,5 @@
 """The failsafe of agents: the safe speed of Krauß, as an acceleration."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

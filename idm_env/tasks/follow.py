@@ -1,7 +1,5 @@
 """Task ``follow``: one controlled vehicle smooths the traffic behind a recorded leader (the I-24 work)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Task ``highway``: drive on among drivers who change lanes, on a ring of several lanes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

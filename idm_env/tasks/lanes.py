@@ -1,7 +1,5 @@
 """What tasks on several lanes share: drivers who change lanes, agents who may command them, and what agents see."""
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Task ``platoon``: controlled vehicles among N in an open lane, and disturbances at its head."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Recorded leaders for tasks: from trajectory files, or the project's own made-up trace."""
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Task ``replay``: a recorded road replayed, with any chosen vehicles handed over to agents or to the model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -8,8 +8,6 @@ for which an action is held, so that its bounds do not depend on ``hold``. Every
 Shapes: the value of a term is ``(..., agents)``, or ``(..., 1)`` where it is the same for all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Task ``ring``: dissolve the stop-and-go wave on a ring road (Flow's wave attenuation)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

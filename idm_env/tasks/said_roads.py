@@ -1,7 +1,5 @@
 """What a user says of an open road: classes of drivers, tables of trips, speed limits, closed lanes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 

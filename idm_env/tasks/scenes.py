@@ -5,8 +5,6 @@ after an empty slot that nobody ever occupies. A vehicle that follows different 
 its own, behind a *seat*: a slot that is placed wherever its recorded leader of the moment is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

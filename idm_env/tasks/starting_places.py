@@ -1,7 +1,5 @@
 """Where vehicles are when an episode of an open road begins: never without the room that an entry asks for."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -12,8 +12,6 @@ A table is anything with columns (a ``DataFrame``, or a mapping of sequences), r
 ===============  =======================================================================================================
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from bisect import bisect_right

@@ -3,8 +3,6 @@
 Shapes: what belongs to agents is ``(…, agents)``, what belongs to vehicles ``[..., n]``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 

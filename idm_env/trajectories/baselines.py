@@ -5,8 +5,6 @@ necessarily regular) and the clock [K] on which the result is wanted; free numbe
 states them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One chunk of tracks: filtered or imitated, compared with the baselines, and written as a part."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Driver parameters from filtered tracks: the calibration of ``fitting.fit`` behind the real, filtered leaders."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ Memory holds one chunk of tracks: the file is spooled to disk by vehicles (``spo
 on disk (``jobs/shards.py``), and the parts are joined at the end without being read as a whole.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time

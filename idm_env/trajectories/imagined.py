@@ -5,8 +5,6 @@ acceleration below ``a [1 − (v/v0)⁴]``. Fitting accelerations or imagined ga
 comes out is always the simulator's own rollout, whose bounds are exact.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """How good a reconstruction is on points of the user's own file that it was not given."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ them apart; data sparser than the correlation of the noise do not, and get white
 Shapes: times and positions of a track are ``[samples]`` (s, m).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

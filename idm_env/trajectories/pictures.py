@@ -1,7 +1,5 @@
 """Trajectories in space and time, before and after: the largest run and lane, coloured by speed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

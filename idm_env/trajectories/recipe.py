@@ -3,8 +3,6 @@
 Shapes: a track has ``[samples]`` (s, m).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The report of a filtered or reconstructed file: JSON for machines, one self-contained HTML page for people."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

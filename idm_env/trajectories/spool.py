@@ -4,8 +4,6 @@ The file is read in pieces, by the rules of ``data.load``. Its rows are brought 
 which vehicles appear; then by time, on the clock of each run, to find who is ahead.
 """
 
-from __future__ import annotations
-
 import shutil
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence

@@ -3,8 +3,6 @@
 For vectors, of one environment too: the statistics are detached, what passes through keeps its graph.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401
+from idm_env.effects.base import hint_of
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.roads import Lanes, lane_drop, on_ramp
 from idm_env.tasks import TASKS, make_task
@@ -57,7 +58,7 @@ def test_every_option_that_is_a_number_has_a_range(name: str) -> None:
     """A new option without one fails here."""
     known = ranges(TASKS[name])
     for field in dataclasses.fields(TASKS[name]):
-        kinds = set(str(field.type).replace("|", " ").split())
+        kinds = set(hint_of(field).replace("|", " ").split())
         if kinds & {"int", "float"} and field.name not in OWN:
             assert field.name in known, field.name
             assert -math.inf < known[field.name].low < known[field.name].high < math.inf
