@@ -194,6 +194,8 @@ SPREAD = 0.3
 STATES = {
     "speed": 3.0, "gap": 4.0, "closing_speed": 1.0, "lead_accel": 0.4, "relative_gap": 0.2, "time_since_stop": 10.0,
     "mean_speed_20s": 3.0, "mean_speed_90s": 3.0, "braking_15s": 0.4, "lead_braking_15s": 0.4,
+    "own_accel": 0.4, "lead_trend": 1.0, "lead_change_3s": 1.0, "headway_behind": 0.5, "gap_behind": 4.0,
+    "second_opening": 0.7,
 }  # fmt: skip
 """Coordinates of the state, with the distance of a curve's knots: it ends where nobody was seen."""
 EDGES = {"position": 5.0, "time": 0.5, "speed": 0.5, "gap": 1.0, "closing_speed": 0.2, "lead_accel": 0.1}

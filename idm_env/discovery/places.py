@@ -84,6 +84,8 @@ def respond(problem: Problem, solution: Solution) -> Responses:
         "lead_accel": records.column("lead_accel")[middle],
         "relative_gap": relative_gap(solution, rows, middle),
         **{name: x[middle] for name, x in records.past.items()},
+        # At the window's start: later it has felt the driver's own noise, as the errors have.
+        "own_accel": np.broadcast_to(records.past["own_accel"][rows.start][:, None], middle.shape),
     }
     linear = solution.linear
     matrix = equations(problem, solution.theta, linear)[1][:, : linear.own, : linear.own]

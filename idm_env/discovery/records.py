@@ -12,7 +12,7 @@ import torch
 from idm_env.data import DataError, Episode, Trajectories
 from idm_env.data.samples import VEHICLES, Samples
 from idm_env.discovery import march
-from idm_env.effects.free import HISTORY, first_history, next_history
+from idm_env.effects.free import AGO, AGO_S, CARRIED, Now, first_history, next_history, room_behind
 from idm_env.fitting.problem import group_of
 
 WINDOW_S = 5.0
@@ -57,20 +57,26 @@ class Records:
 
     @cached_property
     def past(self) -> dict[str, np.ndarray]:
-        """Features of ``HISTORY`` on the measured records [samples], each before the sample counts."""
+        """Features of ``HISTORY`` on the measured records [samples], those carried before the sample counts."""
         begin, lengths = self.bounds[:-1], np.diff(self.bounds)
-        names = ("speed", "accel", "lead_accel")
-        columns = torch.from_numpy(np.stack([self.column(name) for name in names]))
+        signals = dict(zip(march.COLUMNS, torch.from_numpy(self.signals).unbind(-1), strict=True))
+        behind = signals["position"] - torch.from_numpy(np.repeat(self.length, lengths)) - signals["behind_front"]
+        opening = (signals["second_speed"] - signals["lead_speed"]) * signals["second_present"]
+        room = room_behind(behind, signals["behind_speed"], signals["behind_present"])
+        every = Now(signals["speed"], signals["accel"], signals["lead_accel"], *room, opening)
         order = np.argsort(-lengths, kind="stable")
         begin, lengths = begin[order], lengths[order]
-        past = {name: np.empty(len(self.signals)) for name in HISTORY}
-        held = first_history(*columns[:, begin])
+        past = {name: np.empty(len(self.signals)) for name in CARRIED}
+        held = first_history(Now(*(x[begin] for x in every)))
         for i in range(int(lengths[0])):
             going = begin[lengths > i]
             held = {name: x[: len(going)] for name, x in held.items()}
             for name, x in held.items():
                 past[name][going + i] = x.numpy()
-            held = next_history(held, self.dt, *columns[:, going + i])
+            held = next_history(held, self.dt, Now(*(x[going + i] for x in every)))
+        lead, number = self.column("lead_speed"), np.arange(len(self.signals))
+        before = np.maximum(number - round(AGO_S / self.dt), np.repeat(self.bounds[:-1], np.diff(self.bounds)))
+        past[AGO] = lead - lead[before]
         return past
 
     def column(self, name: str) -> np.ndarray:

@@ -149,7 +149,6 @@ class Excluded:
     estimate: float
     low: float
     high: float
-    would_be_found: float
     typical: float
 
 

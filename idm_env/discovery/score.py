@@ -158,16 +158,6 @@ def _flipped(gains: np.ndarray, seed: int, run: np.ndarray) -> np.ndarray:
     return statistic
 
 
-def level(gains: np.ndarray, seed: int, run: np.ndarray, share: float) -> float:
-    """Return from which statistic on a further candidate is significant beside these [K, units].
-
-    ``share`` of ``ALPHA`` is what the test has. A strong candidate is itself among the highest with its own signs.
-    """
-    highest = np.sort(_flipped(gains, seed, run).max(1))[::-1]
-    above = int(np.ceil(ALPHA * share * len(highest))) - 2
-    return float(highest[above]) + 1e-9 if above >= 0 else float(highest[0]) + 1e-9
-
-
 def interval_of(solution: Solution, problem: Problem) -> np.ndarray:
     """Return estimate, low and high [Q, 3] of φ, within its bounds; see ``half_width``."""
     if not len(solution.values):

@@ -303,8 +303,12 @@ class Search:
         curve_of(terms.curve("time_gap", "time", *ramp, label="time_gap ramp"))
         curve_of(terms.curve("acceleration", "time", *_knots(time, 8.0, 24)))
         if first:
-            knots = {c: _knots(responses.coordinates[c], step, 16) for c, step in terms.STATES.items()}
-            curve_of(*(terms.curve(what, c, *knots[c]) for what, c in product(places.WHATS, knots)))
+            seen = {c: responses.coordinates[c] for c in terms.STATES}
+            knots = {c: _knots(x, terms.STATES[c], 16) for c, x in seen.items() if np.ptp(x) > 0.0}
+            shapes = [terms.curve(what, c, *knots[c]) for what, c in product(places.WHATS, knots)]
+            # Each kind has as many fits as the best names: what is told by a name has been held against both.
+            for past in (False, True):
+                curve_of(*(t for t in shapes if t.past is past))
         cycle, gains = places.best_period(responses, "acceleration")
         term = terms.curve("acceleration", "time", 0.0, cycle / 8, 8, cycle, label="acceleration over phase")
         if term.label not in have:

@@ -6,6 +6,7 @@ one compiled loop serves every choice.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -14,7 +15,22 @@ from torch import Tensor
 
 from idm_env.effects import DriverCurve
 from idm_env.effects.base import Effect, P
-from idm_env.effects.free import FEATURES, HISTORY, PER, OverFeature, feature_of, first_history, next_history, share_of
+from idm_env.effects.free import (
+    AGO,
+    AGO_S,
+    CARRIED,
+    FEATURES,
+    HISTORY,
+    NEIGHBOUR,
+    PER,
+    Now,
+    OverFeature,
+    change_of,
+    feature_of,
+    first_history,
+    next_history,
+    share_of,
+)
 from idm_env.effects.places import curve
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
@@ -37,7 +53,7 @@ BY = Parameter("by", "", "1", 0.0, 0.0, float(len(PER)), role="shape")
 """Which state a curve is proportional to: 1 and its place in ``PER``, 0 for none."""
 
 
-def _chosen(values: dict[str, Tensor], p: P) -> Tensor:
+def _chosen(values: Mapping[str, Tensor], p: P) -> Tensor:
     """Return which of the features' values is meant, 0 for none: the loop need not wait for what does not count."""
     x: Any = 0.0
     for feature, value in values.items():
@@ -60,14 +76,24 @@ class _OverAny(OverFeature):
         """Whether the features are those of the past."""
         return self.past
 
+    @property
+    def needs(self) -> frozenset[str]:
+        """All neighbours that features of the past and of neighbours need."""
+        return frozenset(NEIGHBOUR.values()) if self.past else frozenset()
+
+    @property
+    def looks_back(self) -> float:
+        """``AGO_S`` for the past (s)."""
+        return AGO_S if self.past else 0.0
+
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor | None:
         """Return the feature where nothing is known of the past."""
-        return _chosen(first_history(scene.speed, scene.accel, scene.leader.accel), p) if self.past else None
+        return _chosen(first_history(Now.of(scene)), p) if self.past else None
 
     def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the feature one step later."""
-        held = dict.fromkeys(HISTORY, scene.memory[self.name])
-        return _chosen(next_history(held, scene.dt, scene.speed, scene.accel, scene.leader.accel), p)
+        held = dict.fromkeys(CARRIED, scene.memory[self.name])
+        return _chosen(next_history(held, scene.dt, Now.of(scene)), p)
 
 
 def _value(effect: Slot | Push, scene: Scene, driver: Driver, p: P) -> Tensor:
@@ -76,7 +102,7 @@ def _value(effect: Slot | Push, scene: Scene, driver: Driver, p: P) -> Tensor:
         value: Tensor = scene.input(effect.name)
         return value
     if effect.past:
-        x = scene.memory[effect.name]
+        x = torch.where(p["over"] == list(FEATURES).index(AGO), change_of(scene), scene.memory[effect.name])
     else:
         now = [f for f in FEATURES if f not in HISTORY]
         x = _chosen({f: feature_of(scene, driver, f, None) for f in now}, p)

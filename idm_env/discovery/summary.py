@@ -13,9 +13,9 @@ from idm_env.discovery.judgement import Evaluation, Judgement
 from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.march import CURVE
 from idm_env.discovery.model import STATES, Term
-from idm_env.discovery.power import Bar, Strength, powerful, strength_of
-from idm_env.discovery.score import CLOSED_LOOP_SHARE, contrast_of, interval_of, level, rivals
-from idm_env.discovery.selection import LEAST_GAIN, Decided, Round
+from idm_env.discovery.power import Strength, powerful, strength_of
+from idm_env.discovery.score import contrast_of, interval_of, rivals
+from idm_env.discovery.selection import Decided, Round
 from idm_env.discovery.solve import Problem, Solution
 from idm_env.discovery.units import MANY_RUNS, smallest_p, units
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude
@@ -52,8 +52,7 @@ def summarise(
     terms = [] if compared is None else _findings(judged, compared, rounds, problem)
     added, nearest = (terms, []) if judged.added else ([], terms)
     test_runs = [] if evaluation.test is None else list(evaluation.test.runs)
-    run = units(problem.rows.records).run
-    strengths = _strengths(first, problem, bar(first, run, judged.seed, len(test_runs)))
+    strengths = _strengths(first, problem)
     others = [name for f in added if f.effect for name in f.equivalent if name in ALL]
     left = (float("nan") if before is None else before.summary()["horizon_rmse_m"]), floor["horizon_rmse_m"]
     least = judge.least_m(evaluation.records)
@@ -101,7 +100,7 @@ def summarise(
         candidates=candidates_of(rounds, refused),
         shared=judged.shared,
         excluded=[
-            result.Excluded(name, s.parameter.name, s.parameter.unit, s.estimate, s.low, s.high, s.seen, s.typical)
+            result.Excluded(name, s.parameter.name, s.parameter.unit, s.estimate, s.low, s.high, s.typical)
             for name, s in strengths.items()
         ],
         parameters=_parameters(drivers[0], drivers[1], np.unique(evaluation.records.group)),
@@ -180,20 +179,12 @@ def unsure(ladder: Ladder | None, refusal: Refusal) -> tuple[Verdict, Refusal]:
     return Verdict.NONE if ladder is not None and ladder.agrees else Verdict.UNDECIDED, refusal
 
 
-def bar(first: Round, run: np.ndarray, seed: int, kept: int) -> Bar:
-    """Return what a candidate had to reach in the first round, on units of ``run`` [units], and on ``kept`` runs."""
-    # It has to explain half of what any smooth function of the state explains.
-    rest = 0.5 * np.log(2.0 - np.exp(-2.0 * max(float(first.left.mean()), 0.0)))
-    gains = np.array([s.gains for s in first.scored])
-    return Bar(level(gains, seed, run, 1.0 - CLOSED_LOOP_SHARE), max(LEAST_GAIN, float(rest)), kept)
-
-
-def _strengths(first: Round, problem: Problem, reached: Bar) -> dict[str, Strength]:
+def _strengths(first: Round, problem: Problem) -> dict[str, Strength]:
     """Return by name what the first round says of the strengths of effects that have one."""
     strengths = {}
     for s in first.scored:
         if s.solution is not None and s.term.effect is not None and s.term.effect in ALL:
-            strength = strength_of(s.solution, problem, s.term.label, reached)
+            strength = strength_of(s.solution, problem, s.term.label)
             if strength is not None:
                 strengths[s.term.effect] = strength
     return strengths

@@ -144,7 +144,7 @@ class Effect:
             raise TypeError(
                 f"effect {cls.__name__}: kind = {cls.kind!r} names files and columns. Take letters, digits, _ and -."
             )
-        if unknown := cls.needs - NEEDED:
+        if not isinstance(cls.needs, property) and (unknown := cls.needs - NEEDED):
             raise TypeError(
                 f"effect {cls.__name__}: needs = {sorted(unknown)} is unknown. A scene has {', '.join(sorted(NEEDED))}."
             )

@@ -1,9 +1,12 @@
 """Curves over a feature of the scene: what to add when nothing in the catalogue has a name for it."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,14 +16,25 @@ from idm_env.effects.places import curve, on_lap
 from idm_env.parameters import Parameter, nearest
 from idm_env.types import Driver, Scene
 
-HISTORY: dict[str, str] = {
+CARRIED: dict[str, str] = {
     "time_since_stop": "s",
     "mean_speed_20s": "m/s",
     "mean_speed_90s": "m/s",
     "braking_15s": "m/s²",
     "lead_braking_15s": "m/s²",
+    "own_accel": "m/s²",
+    "lead_trend": "m/s",
+    "headway_behind": "s",
+    "gap_behind": "m",
+    "second_opening": "m/s",
 }
-"""Features of the past, with their units: numbers that a driver carries along (``next_history``)."""
+"""Numbers that a driver carries along (``next_history``), with their units."""
+AGO, AGO_S = "lead_change_3s", 3.0
+"""The feature that looks back, and how far (s)."""
+HISTORY: dict[str, str] = {**CARRIED, AGO: "m/s"}
+"""Features of the past and of neighbours beyond the leader, with their units."""
+NEIGHBOUR = {"headway_behind": "behind", "gap_behind": "behind", "second_opening": "second_leader"}
+"""Whom a feature needs to see beside the leader."""
 FEATURES: dict[str, str] = {
     "position": "m",
     "time": "s",
@@ -60,61 +74,118 @@ def feature_of(scene: Scene, driver: Driver, feature: str, period: float | None)
     return on_lap(values[feature], period)
 
 
-def first_history(speed: Tensor, accel: Tensor, lead_accel: Tensor) -> dict[str, Tensor]:
-    """Return the features of ``HISTORY``, shape ``(…, vehicles)``, where nothing is known of the past.
+class Now(NamedTuple):
+    """What ``CARRIED`` features are made of, shape ``(…, vehicles)``: accelerations, and neighbours that are seen.
+
+    ``headway`` is the follower's gap over his speed (at least 1.5 m/s), 5 s at most and where there is none, ``behind``
+    his gap, 40 m likewise; ``opening`` is the second leader's speed less that of the leader (m/s), 0 where none is.
+    """
+
+    speed: Tensor
+    accel: Tensor
+    lead_accel: Tensor
+    headway: Any
+    behind: Any
+    opening: Any
+
+    @classmethod
+    def of(cls, scene: Scene) -> Now:
+        """Return what a scene shows."""
+        second, behind, lead = scene.second_leader, scene.behind, scene.leader
+        room: tuple[Any, Any] = None, None
+        if behind is not None:
+            room = room_behind(behind.gap, behind.speed, behind.present)
+        opening = None if second is None else (second.speed - lead.speed) * second.present
+        return cls(scene.speed, scene.accel, lead.accel, *room, opening)
+
+
+def room_behind(gap: Tensor, speed: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the time gap of the vehicle behind (s), 5 at most, and its gap (m), 40 at most: ``(…, vehicles)``."""
+    follows = present > 0.0
+    time_gap = (gap / speed.clamp_min(1.5)).clamp(0.0, 5.0)
+    return torch.where(follows, time_gap, 5.0), torch.where(follows, gap.clamp(0.0, 40.0), 40.0)
+
+
+def first_history(now: Now) -> dict[str, Any]:
+    """Return the features of ``CARRIED``, shape ``(…, vehicles)``, where nothing is known of the past.
 
     There was no stop, one speed, and no other braking.
     """
-    since = torch.where(speed > STOPPED, LONG_AGO, 0.0 * speed)
-    return dict(zip(HISTORY, (since, speed, speed, torch.relu(-accel), torch.relu(-lead_accel)), strict=True))
+    since, still = torch.where(now.speed > STOPPED, LONG_AGO, 0.0 * now.speed), 0.0 * now.lead_accel
+    braking = torch.relu(-now.accel), torch.relu(-now.lead_accel)
+    values = (since, now.speed, now.speed, *braking, now.accel, still, now.headway, now.behind, now.opening)
+    return dict(zip(CARRIED, values, strict=True))
 
 
-def next_history(
-    held: dict[str, Tensor], dt: float, speed: Tensor, accel: Tensor, lead_accel: Tensor
-) -> dict[str, Tensor]:
-    """Return the features of ``HISTORY`` one step later, shape ``(…, vehicles)``, from those ``held`` and the present.
+def next_history(held: Mapping[str, Tensor], dt: float, now: Now) -> dict[str, Any]:
+    """Return the features of ``CARRIED`` one step later, shape ``(…, vehicles)``, from those ``held`` and the present.
 
-    Time grows by Δt to ``LONG_AGO`` and is 0 while the driver stands; a mean over τ is ``(τ m + Δt v) / (τ + Δt)``; the
-    hardest braking ``max(−a, m τ / (τ + Δt))`` fades, τ = 15 s.
+    Time grows by Δt to ``LONG_AGO`` and is 0 while the driver stands; a mean over τ is ``(τ m + Δt x) / (τ + Δt)``, of
+    the own acceleration with τ = 1 s; the hardest braking ``max(−a, m τ / (τ + Δt))`` fades, τ = 15 s, and so does the
+    leader's change of speed, ``(m + Δt a_lead) τ / (τ + Δt)`` with τ = 5 s.
     """
-    values = {
-        "time_since_stop": lambda m: torch.where(speed > STOPPED, (m + dt).clamp(0.0, LONG_AGO), 0.0 * m),
-        "mean_speed_20s": lambda m: m + (speed - m) * (dt / (20.0 + dt)),
-        "mean_speed_90s": lambda m: m + (speed - m) * (dt / (90.0 + dt)),
-        "braking_15s": lambda m: torch.maximum(-accel, m * (15.0 / (15.0 + dt))),
-        "lead_braking_15s": lambda m: torch.maximum(-lead_accel, m * (15.0 / (15.0 + dt))),
+    values: dict[str, Callable[[Any], Any]] = {
+        "time_since_stop": lambda m: torch.where(now.speed > STOPPED, (m + dt).clamp(0.0, LONG_AGO), 0.0 * m),
+        "mean_speed_20s": lambda m: m + (now.speed - m) * (dt / (20.0 + dt)),
+        "mean_speed_90s": lambda m: m + (now.speed - m) * (dt / (90.0 + dt)),
+        "braking_15s": lambda m: torch.maximum(-now.accel, m * (15.0 / (15.0 + dt))),
+        "lead_braking_15s": lambda m: torch.maximum(-now.lead_accel, m * (15.0 / (15.0 + dt))),
+        "own_accel": lambda m: m + (now.accel - m) * (dt / (1.0 + dt)),
+        "lead_trend": lambda m: (m + now.lead_accel * dt) * (5.0 / (5.0 + dt)),
+        "headway_behind": lambda m: now.headway,
+        "gap_behind": lambda m: now.behind,
+        "second_opening": lambda m: now.opening,
     }
     return {name: values[name](m) for name, m in held.items()}
 
 
+def change_of(scene: Scene) -> Tensor:
+    """Return the leader's speed less that of ``AGO_S`` ago (m/s), shape ``(…, vehicles)``."""
+    return scene.leader.speed - scene.past(0.0 * scene.speed + AGO_S).leader.speed
+
+
 class OverFeature:
-    """Part of an effect that stands over one ``feature``: of one of the past it keeps a memory ``(…, vehicles)``."""
+    """Part of an effect that stands over one ``feature``; one that is carried along is a memory ``(…, vehicles)``."""
 
     feature: str
     name: Any
 
     @property
     def remembers(self) -> bool:
-        """Whether the feature is one of the past."""
-        return self.feature in HISTORY
+        """Whether the feature is carried along."""
+        return self.feature in CARRIED
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """The neighbour that the feature needs, if any."""
+        return frozenset(n for f, n in NEIGHBOUR.items() if f == self.feature)
+
+    @property
+    def looks_back(self) -> float:
+        """``AGO_S`` of the feature that looks back, else 0 (s)."""
+        return AGO_S if self.feature == AGO else 0.0
 
     @property
     def wind_up_s(self) -> float:
-        """The whole record, for a feature of the past."""
+        """The whole record, for a feature that is carried along."""
         return math.inf if self.remembers else Effect.wind_up_s
 
     def x_of(self, scene: Scene, driver: Driver, period: float | None = None) -> Tensor:
         """Return the feature now, in the unit of ``FEATURES``."""
+        if self.feature == AGO:
+            return change_of(scene)
         return scene.memory[self.name] if self.remembers else feature_of(scene, driver, self.feature, period)
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor | None:
         """Return the feature where nothing is known of the past."""
-        return first_history(scene.speed, scene.accel, scene.leader.accel)[self.feature] if self.remembers else None
+        first: Tensor | None = first_history(Now.of(scene))[self.feature] if self.remembers else None
+        return first
 
     def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the feature one step later."""
         held = {self.feature: scene.memory[self.name]}
-        return next_history(held, scene.dt, scene.speed, scene.accel, scene.leader.accel)[self.feature]
+        later: Tensor = next_history(held, scene.dt, Now.of(scene))[self.feature]
+        return later
 
 
 def share_of(scene: Scene, driver: Driver, state: str) -> Tensor:

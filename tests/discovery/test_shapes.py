@@ -11,6 +11,7 @@ import torch
 
 from benchmarks import discovery as sets
 from idm_env.data import synthetic
+from idm_env.delay_buffer import PAST
 from idm_env.discovery import Discovery, crossed, discover, found, model as terms, write_report
 from idm_env.discovery.compare import ERRORS
 from idm_env.discovery.march import PULSED, Catalogue
@@ -123,7 +124,8 @@ def test_every_shape_is_the_same_in_its_file_and_in_the_model(
         after = simulator.step(state, {}, params)  # so that leaders have accelerations
         assert bool(effects) is bool(after.memory) or coordinate not in HISTORY
         held = torch.linspace(0.0, 2.0 * terms.STATES[coordinate], 60, dtype=torch.float64)  # a lively past
-        return simulator.acceleration(after._replace(memory=dict.fromkeys(after.memory, held)), {}, params)
+        memory = {k: held if k != PAST else x * held[:, None, None] for k, x in after.memory.items()}
+        return simulator.acceleration(after._replace(memory=memory), {}, params)
 
     mine, theirs = accelerations((of_file,), {}), accelerations(tuple(of_model), numbers)
     assert torch.allclose(mine, theirs, rtol=0.0, atol=1e-9)
