@@ -402,7 +402,9 @@ class Batch:
         watched = self.recording is not None or (self.counters is not None and bool(self.counters.loops))
         stepped = None
         if self.values is not None and not self.task.simulator.untried:
-            stepped = self._step_values(action, live, 1 if watched or self.settings.output == "torch" else steps)
+            stepped = self._step_values(
+                action, live, observed, 1 if watched or self.settings.output == "torch" else steps
+            )
         if stepped is None:
             with torch.no_grad() if self.settings.output == "numpy" else contextlib.nullcontext():
                 stepped = self._step_torch(action, live, observed), 1
@@ -430,7 +432,9 @@ class Batch:
         outputs = {name: x.clone() for name, x in outputs.items()}
         return {n: x.cpu().numpy() for n, x in outputs.items()} if self.settings.output == "numpy" else outputs
 
-    def _step_values(self, action: Any, live: Tensor | None, steps: int) -> tuple[dict[str, Any], int] | None:
+    def _step_values(
+        self, action: Any, live: Tensor | None, observed: bool, steps: int
+    ) -> tuple[dict[str, Any], int] | None:
         """Return the outputs of steps by compiled loops, and their number; None, with nothing changed, without loops.
 
         Of several rewards are summed, and the rest is that of the last one.
@@ -447,12 +451,12 @@ class Batch:
             who = None if live is None else live.numpy().reshape(-1)
             if steps > 1:
                 left, noise = self.ahead()
-                rows = values.hold(action, who, noise, self.used, self.episode_params(), min(steps, left))
+                rows = values.hold(action, who, noise, self.used, self.episode_params(), steps, left)
                 outputs, steps = _summed(*rows), rows[1]
                 self.used += steps
             else:
                 noise = None if self._normals(values.clock) is None else self._drawn
-                outputs = values.step(action, who, noise, max(self.used - 1, 0), self.episode_params())
+                outputs = values.step(action, who, noise, max(self.used - 1, 0), self.episode_params(), observed)
         except Untraceable as why:
             self._world, self._loaded = self.world, False
             self.used, self._block = used, block

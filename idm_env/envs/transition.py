@@ -26,6 +26,7 @@ from idm_env.compiled.scalar.record import Unordered, Untraceable
 from idm_env.delay_buffer import PAST
 from idm_env.envs.moves import Moves
 from idm_env.envs.past import ROOM
+from idm_env.envs.settings import INFO
 from idm_env.envs.worlds import WHOLE, Array, Layout, Moment, Room, RowTable, address, named, row_addresses, world_of
 from idm_env.tasks import EnvState
 from idm_env.types import Params, State
@@ -70,6 +71,8 @@ class WholeStep:
         self.sample = self.sample | {n: torch.ones(many, count, dtype=real) for n, count in wide.items()}
         inputs |= {n: self.sample[n] for n in wide}
         self.wanted = [f"p{i}" for i, (_, _, _, flows) in enumerate(form) if flows]
+        if task.held > 1:
+            inputs["looks"] = torch.ones(many, dtype=torch.bool)
         past, pitches = like.memory.get(PAST), {}
         if past is not None:
             slots, count = past.shape[-2:]
@@ -81,7 +84,9 @@ class WholeStep:
         self._by = [*flowing, *(n for n in ("action", "past") if n in inputs), *self.wanted]
         simulator = task.simulator
         self._stepper = Stepper(simulator.road, simulator.effects, simulator.dt, simulator.integration)
-        self.forward = RowFunction(self._step, inputs, many, pitches=pitches)
+        seldom = ("observation", *(f"info_{n}" for n in INFO if n != "rewards")) if task.held > 1 else ()
+        when = "looks", "whole_terminated", "whole_truncated"
+        self.forward = RowFunction(self._step, inputs, many, pitches=pitches, seldom=seldom, when=when)
         self.told = [n for n in self.forward.outs if not n.startswith("then_")]
 
     def _step(self, **leaves: Tensor) -> dict[str, Tensor]:
@@ -251,6 +256,7 @@ class CompiledTransition:
         self._kind, self._draws, self._recorded = kind, draws, dict[Form, WholeStep]()
         self._bound: Tables | None = None
         self._normals: dict[str, tuple[Array, int]] = {}
+        self._looks = [np.full(self.rows, flag) for flag in (False, True)]
         self.threads = 1 if self.count < 2 * pool.GRAIN else pool.count(self.count)
         self.before = tuple(group for prefix in self.worlds for group in self.groups(prefix))
 
@@ -344,7 +350,8 @@ class CompiledTransition:
 
     def pointers(self, moment: Moment) -> dict[str, int]:
         """Return the addresses of all that a step is given beside its worlds: its adjoint is given the same."""
-        pointers = {"state_step": address(moment.clock)}
+        looks = address(self._looks[moment.looks % self.task.held == 0])
+        pointers = {"state_step": address(moment.clock), "looks": looks}
         if moment.action is not None:
             pointers["action"] = address(moment.action)
         if moment.live is not None:
@@ -362,7 +369,9 @@ class CompiledTransition:
         """Return the addresses of what steps are given that come ``count`` steps after the first one."""
         moment.given = self.pointers(moment)
         apart = {f"normal_{n}": self.pitch for n in moment.normals or ()} | dict.fromkeys(_PAST, -self.slot)
-        return {n: x + count * apart.get(n, 0) for n, x in moment.given.items()}
+        pointers = {n: x + count * apart.get(n, 0) for n, x in moment.given.items()}
+        looks = (count - moment.looks) % self.task.held == 0
+        return pointers | {"looks": np.where(looks, *(address(x) for x in self._looks[::-1]))}
 
     # -- backwards -----------------------------------------------------------------------------------------------
 

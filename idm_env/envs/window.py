@@ -228,7 +228,7 @@ class Tape:
             past, clock, now = values.past, self.clocks[done], done // held
             moment = Moment(
                 clock, self.action[now], self.on_road[now * held], normals, batch.used, past.numbers, past.newest,
-                bound, values.whole,
+                bound, values.whole, looks=(held - 1 - done) % held,
             )  # fmt: skip
             self.held_memory += [normals, past.numbers]
             pointers = plan.spread(moment, steps - done) | {"state_step": row_addresses(self.clocks, steps)}

@@ -54,6 +54,8 @@ class Moment:
     """Whole numbers ``(WHOLE, vehicles)`` before the step, on a road of several lanes."""
     crossing: Any = None
     """What became of them (``lane_transition.Crossing``)."""
+    looks: int = 0
+    """After how many further steps somebody looks at what is seldom told, and again with every action."""
     given: dict[str, int] = field(default_factory=dict)
     """The addresses of what the step's loops were given beside its worlds."""
     begins: tuple[int, ...] = ()

@@ -58,6 +58,9 @@ _ELEMENT = re.compile(r"\b(?:[fdib]|out_\w+)\[U\((\d+|r)[^\[\]]*\]")
 _STORAGE = re.compile(r"\b([fdib])\[U\((\d+)")
 """Where an element of the workspace begins, whatever its index is."""
 
+IF = "if "
+"""How the line begins after which all else is done in some rows only."""
+
 _NUMBER = re.compile(r"v\d+ = ")
 """A number of a row, with a name of its own."""
 
@@ -190,11 +193,12 @@ def fused(parts: Sequence[list[str]], widths: Mapping[str, int] | None = None) -
     ]
     if widths is not None:
         _local(groups)
-    text: list[str] = []
+    text, within = list[str](), ""
     for (head, lines), whole in zip(groups, vectors_of, strict=True):
         if whole:
             head = [_ONE_LOOP.sub(lambda m: f"for j0 in range({padded(int(m[1]))}):", head[0])]
-        text += [*head, *("    " * len(head) + line for line in lines)]
+        text += [within + line for line in (*head, *("    " * len(head) + line for line in lines))]
+        within = "    " if lines[0].startswith(IF) else within
     return text
 
 

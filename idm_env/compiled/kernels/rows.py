@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from idm_env.compat import Uncompiled
 from idm_env.compiled.kernels.memory import addresses
-from idm_env.compiled.kernels.row_text import BINARY, COMPARE, REDUCE, UNARY, VECTOR, body, fused, loops, padded
+from idm_env.compiled.kernels.row_text import BINARY, COMPARE, IF, REDUCE, UNARY, VECTOR, body, fused, loops, padded
 from idm_env.compiled.scalar import library
 from idm_env.compiled.scalar.record import Untraceable
 from idm_env.types import recording
@@ -110,7 +110,7 @@ class RowFunction:
     ``inputs`` are examples with ``rows`` rows each. ``needs`` are the names of those that are read, and ``outs`` of
     those that are filled: in this order, behind what is ``fixed``, ``call`` takes their addresses. ``shapes`` and
     ``types`` are those of the outputs, without rows. ``pitches`` are distances from row to row of outputs that do not
-    lie one behind another.
+    lie one behind another. Outputs that are ``seldom`` read are filled only where an input or output ``when`` is true.
 
     Raises:
         Untraceable: For an operation that is not known here, or mixes rows.
@@ -127,7 +127,7 @@ class RowFunction:
 
     def __init__(
         self, function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor], rows: int, *,
-        pitches: Mapping[str, int] | None = None,
+        pitches: Mapping[str, int] | None = None, seldom: Sequence[str] = (), when: Sequence[str] = (),
     ) -> None:  # fmt: skip
         self._rows, self._pitches = rows, pitches or {}
         self._places: dict[int, Place] = {}
@@ -156,16 +156,28 @@ class RowFunction:
         self._results: dict[Any, int] = {}
         self._written = {storage(x) for name, _, _, out in calls if _in_place(name) for x in tensors((out,))}
         read = {storage(x) for _, args, _, _ in calls for x in tensors(args)} | {storage(x) for x in results.values()}
+        read |= {storage(inputs[n]) for n in when if n in inputs}
         self._parts += [lines for where, lines in self._loads.items() if where in read]
+        # What is written in place is read in the order of the recording.
+        kept = [x for _, args, _, out in calls if self._reads_written(args) for x in tensors((out,))]
+        often = set(map(id, _needed(operations, [*kept, *(x for n, x in results.items() if n not in seldom)])))
         for call in calls:
-            self._print(*call)
+            if id(call) in often:
+                self._print(*call)
         moving = {name: x for name, x in results.items() if self._by_row(name, x)}
         self.shapes = {name: tuple(x.shape[1:]) for name, x in moving.items()}
         kinds = {name: self._kind(x) for name, x in moving.items()}
         real = np.dtype(np.float32 if self._floats == torch.float32 else np.float64)
         self.types = {name: TYPES.get(kind, real) for name, kind in kinds.items()}
-        for name, x in moving.items():
-            self._parts.append(self._tell(name, x, kinds[name]))
+        for name in [n for n in moving if n not in seldom]:
+            self._parts.append(self._tell(name, moving[name], kinds[name]))
+        if rest := [n for n in moving if n in seldom]:
+            known = {**inputs, **results}
+            self._parts.append([f"{IF}{' or '.join(self._at(known[n], []) for n in when)}:"])
+            for call in calls:
+                if id(call) not in often:
+                    self._print(*call)
+            self._parts += [self._tell(n, moving[n], kinds[n]) for n in rest]
         lines = fused(self._parts, self._widths if self.lean else None)
         lines = self._first(lines) + lines
         text = "\n".join(lines)
@@ -372,7 +384,7 @@ class RowFunction:
             lies = self._stores.get(storage(part)) or one.detach().cpu().numpy().tobytes()
             return part.dtype, part.shape, part.stride(), part.storage_offset(), lies
 
-        if any(storage(part) in self._written for part in (x, *tensors(args))):
+        if self._reads_written((x, *args)):
             return False
         key = name, mark(args), mark(tuple(kwargs.items())), x.shape, x.stride()
         first = self._results.setdefault(key, storage(x))
@@ -380,6 +392,9 @@ class RowFunction:
             self._stores[storage(x)] = self._stores[first]
             self._place(x)
         return first != storage(x)
+
+    def _reads_written(self, args: Sequence[Any]) -> bool:
+        return any(storage(x) in self._written for x in tensors(args))
 
     def _began(self, x: Tensor) -> None:
         """Give a constant of one value, that is written to now, a place."""
