@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from idm_env.compiled.kernels.past_in_place import Stepper
 from idm_env.compiled.kernels.reads import Reads
 from idm_env.compiled.kernels.rows import RowFunction, adjoint, storage
 from idm_env.compiled.kernels.sameness import digest
+from idm_env.compiled.kernels.window_loop import each_table
 from idm_env.compiled.scalar.record import Unordered, Untraceable
 from idm_env.delay_buffer import PAST
 from idm_env.envs.moves import Moves
@@ -33,7 +34,7 @@ from idm_env.types import Params, State
 
 _ROWS = (1009, 1013, 1019, 1021, 1031)
 """Numbers of rows of a recording: one that is no other dimension tells rows apart from everything else."""
-_BLOCK, _PAST = 64, ("past", "then_past")
+_BLOCK, _PAST = 8, ("past", "then_past")
 """Rows that do all steps of an action before the next ones, and what steps read and write of the past."""
 
 Form = tuple[tuple[str, str, bool, bool], ...]
@@ -316,14 +317,8 @@ class CompiledTransition:
         cells["state_step"][1:] = cells["clock"][:-1]
         later = worlds.data_ptr() + (first + count) * (worlds.shape[1] * self.pitch)
         begins = np.concatenate(([now.data_ptr()], later[:-1]))
-        table = bound.ahead.filled(cells, *self.columns(moment, now, begins, later))
-        loops, tables = bound.recorded.forward, range(address(table), address(table) + table.nbytes, table[0].nbytes)
-
-        def some(begin: int, end: int) -> None:
-            for low in range(begin, end, _BLOCK):  # what they read and write stays in the cache
-                for where in tables:
-                    loops.run(low, min(low + _BLOCK, end), where)
-
+        tables = bound.ahead.filled(cells, *self.columns(moment, now, begins, later))
+        some = partial(each_table, bound.recorded.forward.call, _BLOCK, tables)
         pool.split(some, self.rows, 1, self.threads)
 
     def begins(self, moment: Moment, now: Tensor, later: int, tape: bool) -> tuple[int, ...]:

@@ -153,17 +153,16 @@ class Values:
     ) -> dict[str, Any]:  # fmt: skip
         """Advance all rows; ``normals`` are blocks (steps, rows · vehicles) by effect, ``at`` the step in them.
 
-        Unless anybody ``looks``, observations and most infos are told only of rows whose episodes end. ``live`` says whose actions count (all, where it is None). Arrays are told; tensors where there may be a graph.
+        Unless anybody ``looks``, observations and most infos are told only of rows whose episodes end. ``live`` says
+        whose actions count (all, where it is None). Arrays are told; tensors where there may be a graph.
         """
         plan = self.plan((action is None, live is None), tuple(normals or ()))
         bound = plan.of(self.layout, params)
         if self.past.slots:
             self.past.room()
         past = self.past
-        moment = Moment(
-            self._clock, _in_rows(action), live, normals, at, past.numbers, past.newest, bound, self.whole,
-            looks=int(not looks),
-        )  # fmt: skip
+        parts = self._clock, _in_rows(action), live, normals, at, past.numbers, past.newest, bound, self.whole
+        moment = Moment(*parts, looks=int(not looks))
         outputs: dict[str, Any]
         if self._graph and torch.is_grad_enabled() and self._differentiated(action, bound):
             outputs = self._noted(plan, moment, action, bound)
@@ -188,8 +187,8 @@ class Values:
     ) -> tuple[dict[str, Array], int]:  # fmt: skip
         """Advance all rows under one action by ``steps`` at once, or until somebody's episode is over; no graph.
 
-        As ``step``, with at ``most`` so many, and a look after the last; returns what is told after each of them ``[steps, rows, …]``, until the next call, and how many
-        were done: at least one.
+        As ``step``, at ``most`` so many, and somebody looks after the last; returns what is told after each of them
+        ``[steps, rows, …]``, until the next call, and how many were done: at least one.
         """
         plan, past = self.plan((action is None, live is None), tuple(normals or ())), self.past
         bound, command, looks = plan.of(self.layout, params), _in_rows(action), steps - 1
@@ -198,10 +197,8 @@ class Values:
         now, clock, lanes = self.blocks, self._clock, self.whole
         while done < steps:
             count = min(steps - done, 1 + plan.until(clock + 1))
-            moment = Moment(
-                clock, command, live, normals, at + done, past.numbers, past.newest - done, bound, lanes,
-                looks=looks - done,
-            )  # fmt: skip
+            parts = clock, command, live, normals, at + done, past.numbers, past.newest - done, bound, lanes
+            moment = Moment(*parts, looks=looks - done)
             plan.run_together(moment, now, done, count)
             whole += [None] * count if moment.crossing is None else moment.crossing.later
             done += count

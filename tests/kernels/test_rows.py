@@ -120,3 +120,24 @@ def test_a_whole_step_on_several_lanes_is_one_function_of_rows():
             assert np.array_equal(out[name].reshape(x.shape), x.numpy()), name
         leaves = {n: after[f"then_{n}"].contiguous() for n in leaves}
     assert all(int(leaves[n].sum()) > ROWS for n in ("links_changed", "trips_entered", "trips_left"))
+
+
+def test_what_is_seldom_read_is_filled_where_it_is_asked_for_or_where_a_row_ends():
+    """And what was written to in place is read as it was then."""
+
+    def function(x, looks):
+        kept, once = x.clone(), x * 2.0
+        doubled = kept.exp()
+        kept += once
+        return {"ends": kept.sum(-1) > 5.0, "sum": kept, "seen": once.sin(), "then": doubled.cos()}
+
+    x = torch.tensor([[0.1, 0.2], [0.3, 0.1], [2.0, 1.0]], dtype=torch.float64)
+    looks = torch.tensor([False, True, False])
+    samples = {"x": x[:1].expand(MANY, 2).contiguous(), "looks": looks[:1].expand(MANY).contiguous()}
+    loops = RowFunction(function, samples, MANY, seldom=("seen", "then"), when=("looks", "ends"))
+    out = {n: np.full((ROWS, *shape), -7, loops.types[n]) for n, shape in loops.shapes.items()}
+    loops.run(0, ROWS, loops.table({"x": x.numpy(), "looks": looks.numpy()} | out).ctypes.data)
+    for name, expected in function(x, looks).items():
+        filled = [False, True, True] if name in ("seen", "then") else [True] * 3
+        np.testing.assert_allclose(out[name][filled], expected.numpy()[filled], rtol=1e-14)
+        assert (out[name][~np.array(filled)] == -7).all()

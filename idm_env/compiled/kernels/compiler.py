@@ -49,7 +49,8 @@ def module_text(module: str) -> str:
 def name_of(function: Callable[..., Any], options: dict[str, Any]) -> Callable[[str], str]:
     """Return what names a version of a function: by its own file, all files here, and options, by content."""
     code = function.__code__
-    identity = f"{function.__module__} {function.__qualname__} {code.co_firstlineno} {sorted(options.items(), key=str)}"
+    own = sorted((n, sorted(x) if isinstance(x, set) else x) for n, x in options.items())
+    identity = f"{function.__module__} {function.__qualname__} {code.co_firstlineno} {own}"
     word = re.sub(r"\W", "_", function.__qualname__)[-60:]
 
     def name(version: str) -> str:
@@ -61,7 +62,8 @@ def name_of(function: Callable[..., Any], options: dict[str, Any]) -> Callable[[
 
 def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a loop with these options of numba; its machine code is kept."""
-    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True} | options
+    # Without its own word numba takes over the arithmetic of whoever happens to call a loop first.
+    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "fastmath": False} | options
     return lambda function: compat.compiled_loop(function, options, name_of(function, options), STORE, LINKS)
 
 

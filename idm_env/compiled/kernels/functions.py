@@ -183,7 +183,7 @@ _odd_of, _even_of = _polynomial(types.float32, _UP), _polynomial(types.float32, 
 _MOST_32 = np.float32(7.90531110763549805)
 
 
-@compiler(forceinline=True)
+@compiler(forceinline=True, fastmath={"contract", "reassoc"})
 def tanh_float32(x):
     """Return tanh of a float, within some units in the last place: the quotient of polynomials that Eigen takes."""
     y = -_MOST_32 if x < -_MOST_32 else x

@@ -11,7 +11,6 @@ import numpy as np
 
 from idm_env.compiled.kernels.compiler import apart
 from idm_env.compiled.kernels.memory import copy, fill, gather, number
-from idm_env.compiled.kernels.order_loops import walk
 from idm_env.compiled.kernels.phases import call, call_rows
 from idm_env.compiled.kernels.tiles import ROW, exact, padded, workspace
 
@@ -26,6 +25,58 @@ ARRAY, LANE, AHEAD, BEHIND, LAPS_AHEAD, LAPS_BEHIND, OPENS, CLOSES, STOPS = rang
 
 KIND, SIDE, PLACE, ADDRESS, BY_ROW, BY_VEHICLE = range(6)
 """Columns of the plan of rows. Sides are 0 for the own lane, 1 left and 2 right; places are (side, vehicles up)."""
+
+
+@apart
+def walk(leader, follower, lane, position, present, coming, n, count, ring, base, order, begin, place):
+    """Put one row in order by its links, and places (m, within one lap) by rank; False if places do not fall.
+
+    ``coming`` says that ``present`` tells who is there.
+    """
+    heads, furthest, on_road = np.empty(count, np.int64), np.empty(count), 0
+    for k in range(count):
+        heads[k], furthest[k] = -1, -1.0
+    for i in range(n):
+        if coming and present[base + i] <= 0:
+            continue
+        on_road += 1
+        k = lane[base + i]
+        if ring > 0:
+            x = np.float64(position[base + i])
+            x -= np.floor(x / ring) * ring
+            if heads[k] < 0 or x > furthest[k]:
+                heads[k], furthest[k] = i, x
+        elif leader[base + i] == i or (coming and present[base + leader[base + i]] <= 0):
+            if heads[k] >= 0:
+                return False
+            heads[k] = i
+    rank = 0
+    for k in range(count):
+        begin[k] = rank
+        i = heads[k]
+        if i < 0:
+            continue
+        while rank < on_road:
+            x = np.float64(position[base + i])
+            if ring > 0:
+                x -= np.floor(x / ring) * ring
+            if rank > begin[k] and x > place[rank - 1]:
+                return False
+            order[rank], place[rank] = i, x
+            rank += 1
+            following = follower[base + i]
+            if following == i or following == heads[k]:
+                break
+            i = following
+    begin[count] = rank
+    if rank < on_road:
+        return False
+    if coming:
+        for i in range(n):
+            if present[base + i] <= 0:
+                order[rank] = i
+                rank += 1
+    return rank == n
 
 
 @exact

@@ -83,16 +83,15 @@ class PolicyRows(RowFunction):
 
     options = ', fastmath={"contract", "reassoc"}'
     imports = (
-        "from idm_env.compiled.kernels.dense import dense, outer\n"
-        "from idm_env.compiled.kernels.functions import "
-        "exp_{kind} as exp, sigmoid_{kind} as sigmoid, tanh_{kind} as tanh\n"
+        f"{RowFunction.imports}from idm_env.compiled.kernels.dense import dense, outer\n"
+        "from idm_env.compiled.kernels.functions import exp_{kind} as exp, sigmoid_{kind} as sigmoid\n"
     )
     around = (
         f"    for first in range(begin, end, {PITCH}):\n"
         f"        count = min({PITCH}, end - first)\n"
         f"        m = (count + {ROWS - 1}) // {ROWS} * {ROWS}\n"
     )
-    unary = {**UNARY, "exp": "exp({0})", "sigmoid": "sigmoid({0})", "tanh": "tanh({0})"}  # noqa: RUF012
+    unary = {**UNARY, "exp": "exp({0})", "sigmoid": "sigmoid({0})"}  # noqa: RUF012
     simpler, lean = _SIMPLER, False
 
     def __init__(

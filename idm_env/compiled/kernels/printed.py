@@ -36,7 +36,8 @@ import numpy as np
 from numba import carray, types
 
 from idm_env.compiled.kernels.emitted import emitted
-from idm_env.compiled.kernels.functions import exp_{kind} as exp, log1p_{kind} as log1p, sigmoid_{kind} as sigmoid
+from idm_env.compiled.kernels.functions import exp_{kind} as exp, log1p_{kind} as log1p
+from idm_env.compiled.kernels.functions import sigmoid_{kind} as sigmoid, tanh_{kind} as tanh
 
 ROW = {row}
 SIZE = (1 << 40,)

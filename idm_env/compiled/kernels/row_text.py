@@ -12,7 +12,7 @@ UNARY = {
     "exp": "np.exp({0})", "log1p": "np.log1p({0})",
     "expm1": "np.expm1({0})", "rsqrt": "(F(1.0) / np.sqrt({0}))", "log": "np.log({0})",
     "floor": "np.floor({0})", "round": "np.rint({0})", "isinf": "np.isinf({0})", "sin": "np.sin({0})",
-    "cos": "np.cos({0})", "relu": "larger({0}, F(0))", "tanh": "np.tanh({0})", "logical_not": "(not {0})",
+    "cos": "np.cos({0})", "relu": "larger({0}, F(0))", "tanh": "tanh({0})", "logical_not": "(not {0})",
     "bitwise_not": "(not {0})", "sign": "F(np.sign({0}))", "sgn": "F(np.sign({0}))",
 }  # fmt: skip
 BINARY = {

@@ -116,7 +116,8 @@ class RowFunction:
         Untraceable: For an operation that is not known here, or mixes rows.
     """
 
-    options, imports, unary = "", "", UNARY
+    options, unary = "", UNARY
+    imports = "from idm_env.compiled.kernels.functions import tanh_{kind} as tanh\n"
     """How it is compiled, what is imported for that, and operations on single numbers."""
     around = "    for r in range(begin, end):\n"
     """The loop over rows."""
@@ -159,8 +160,8 @@ class RowFunction:
         read |= {storage(inputs[n]) for n in when if n in inputs}
         self._parts += [lines for where, lines in self._loads.items() if where in read]
         # What is written in place is read in the order of the recording.
-        kept = [x for _, args, _, out in calls if self._reads_written(args) for x in tensors((out,))]
-        often = set(map(id, _needed(operations, [*kept, *(x for n, x in results.items() if n not in seldom)])))
+        ordered = [x for _, args, _, out in calls if self._reads_written(args) for x in tensors((out,))]
+        often = set(map(id, _needed(operations, [*ordered, *(x for n, x in results.items() if n not in seldom)])))
         for call in calls:
             if id(call) in often:
                 self._print(*call)
@@ -172,8 +173,8 @@ class RowFunction:
         for name in [n for n in moving if n not in seldom]:
             self._parts.append(self._tell(name, moving[name], kinds[name]))
         if rest := [n for n in moving if n in seldom]:
-            known = {**inputs, **results}
-            self._parts.append([f"{IF}{' or '.join(self._at(known[n], []) for n in when)}:"])
+            tensor_of = {**inputs, **results}
+            self._parts.append([f"{IF}{' or '.join(self._at(tensor_of[n], []) for n in when)}:"])
             for call in calls:
                 if id(call) not in often:
                     self._print(*call)
@@ -420,6 +421,7 @@ class RowFunction:
             name, args = "where", (args[1], args[2], args[0])
         if name in self.unary or name in ("_to_copy", "clone"):
             form = self.unary.get(name, "{0}")
+            form = form.replace("tanh(", "np.tanh(") if to.kind == "d" else form
             kind = None if name == "isinf" else to.kind
             return self._each(to, shape, lambda cell: form.format(self._at(args[0], cell, kind)))
         if name in BINARY or name in COMPARE:

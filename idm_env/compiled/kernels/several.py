@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from idm_env.compiled.kernels import lanes, tiles
-from idm_env.compiled.kernels.lane_changes import Traffic, decision
+from idm_env.compiled.kernels.lane_changes import decision
 from idm_env.compiled.kernels.printed import TileKernel, tile_kernel
+from idm_env.compiled.kernels.traffic import Traffic
 from idm_env.compiled.scalar.record import Form
 from idm_env.delay_buffer import PAST
 from idm_env.effects.base import Remembering

@@ -20,6 +20,14 @@ AHEAD = 8
 
 
 @exact
+def each_table(step, block, asks, begin, end):
+    """Do the steps of some tables with a block of rows, then with the next one: what they touch stays in the cache."""
+    for low in range(begin, end, block):
+        for ask in asks:
+            call_rows(step, low, min(low + block, end), ask)  # type: ignore[call-arg]
+
+
+@exact
 def window(policy, acts, step, asks, rows, held, odd, begin, end, first, last, seen, last_seen, ends, cuts):
     """Do steps ``first`` to ``last`` of some blocks, or until somebody's episode is over; return the next step.
 

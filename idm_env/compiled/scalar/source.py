@@ -55,7 +55,7 @@ def row(slot: Leaf) -> str:
 _FORMS: dict[str, str] = {
     "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}", "pow": "{0} ** {1}",
     "abs": "abs({0})", "sqrt": "np.sqrt({0})", "exp": "exp({0})", "expm1": "np.expm1({0})", "log": "np.log({0})",
-    "log1p": "log1p({0})", "tanh": "np.tanh({0})", "sin": "np.sin({0})", "cos": "np.cos({0})",
+    "log1p": "log1p({0})", "tanh": "tanh({0})", "sin": "np.sin({0})", "cos": "np.cos({0})",
     "floor": "np.floor({0})", "detach": "{0}", "sigmoid": "sigmoid({0})",
     "relu": "{zero} if {0} < {zero} else {0}", "clamp_min": "{1} if {0} < {1} else {0}",
     "clamp_max": "{1} if {0} > {1} else {0}", "maximum": "{0} if {0} > {1} else {1}",
