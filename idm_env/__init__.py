@@ -20,9 +20,8 @@ _LAZY = {
     "types": ("Command", "Record", "State"),
 }
 
-_TASKS = (
-    "follow", "platoon", "replay", "ring", "highway", "open_highway", "merge", "bottleneck", "replay_lanes", "approach",
-)  # fmt: skip
+_LANES_TASKS = ("highway", "open_highway", "merge", "bottleneck", "replay_lanes", "approach")
+_TASKS = ("follow", "platoon", "replay", "ring", *_LANES_TASKS)
 """The keys of ``idm_env.tasks.TASKS``, which needs torch."""
 
 __all__ = ["__version__", *(name for names in _LAZY.values() for name in names)]

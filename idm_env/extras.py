@@ -3,12 +3,8 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-OF = {
-    **dict.fromkeys(("google", "jinja2", "matplotlib", "polars", "pyarrow", "rich", "scipy",
-                     "typer", "yaml"), "data"),
-    **dict.fromkeys(("llvmlite", "numba"), "kernels"),
-    "pygame": "render", "ray": "ray", "stable_baselines3": "sb3",
-}  # fmt: skip
+OF = dict.fromkeys(("google", "jinja2", "matplotlib", "polars", "pyarrow", "rich", "scipy", "typer", "yaml"), "data")
+OF |= {"llvmlite": "kernels", "numba": "kernels", "pygame": "render", "ray": "ray", "stable_baselines3": "sb3"}
 """Module → the extra that installs it."""
 
 

@@ -271,11 +271,11 @@ def top_level() -> set[str]:
         (ways_up, 0),
         (classes_named_twice, 7),
         (lines_behind_a_step, 2307),
-        (lines_of_code, 35487),
+        (lines_of_code, 35295),
         (functions_of_many_parameters, 15),
         (high_packages, 1),
         (file_names_twice, 25),
-        (set_by_hand, 282),
+        (set_by_hand, 158),
     ],
     ids=lambda x: getattr(x, "__name__", None),
 )
@@ -611,7 +611,7 @@ def sentences_without_a_noun() -> list[str]:
 
 @pytest.mark.parametrize(
     ("offenders", "most"),
-    [(functions_named_by_riddles, 133), (sentences_without_a_noun, 271)],
+    [(functions_named_by_riddles, 133), (sentences_without_a_noun, 270)],
     ids=["names", "sentences"],
 )
 def test_names_and_docstrings_are_words_of_the_field(offenders: Callable[[], list[str]], most: int) -> None:

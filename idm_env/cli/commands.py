@@ -321,10 +321,9 @@ def fit(
         first_lane: --lane-changes: where the lowest lane is, left or right.
     """
     if lane_changes:
-        source_of_changes = {"data", "out", "model", "base", "seed", "ring_length", "layout", "columns", "where",
-                             "lane_changes", "every", "ahead", "first_lane", "trust"}  # fmt: skip
-        _only(context, "--lane-changes", source_of_changes)
-        _fit_lane_changes(data, job.out, model, base, seed, file, every, ahead, first_lane)
+        reading = {"data", "out", "model", "base", "seed", "ring_length", "layout", "columns", "where", "trust"}
+        _only(context, "--lane-changes", reading | {"lane_changes", "every", "ahead", "first_lane"})
+        _fit_lane_changes(data, job.out, file, (model, base, every, ahead, first_lane, None, int(seed)))
         return
     _only(context, "", set(context.params) - {"every", "ahead", "first_lane"})
     share: str | float | None = held_out
@@ -342,9 +341,8 @@ def fit(
             vtypes.refuse(sumo, base or "idm")
         _work_begins()
         source = Source(data, **dataclasses.asdict(file))
-        options = Options(
-            by, share, objective, relative, loss, method, integration, starts, seed, substeps, model, base,  # type: ignore[arg-type]
-        )  # fmt: skip
+        cost = by, share, objective, relative, loss, method, integration
+        options = Options(*cost, starts, seed, substeps, model, base)  # type: ignore[arg-type]
         with job.running(report) as run:
             result = fit_file(source, options, job.out, **run)
         if sumo is not None and not result["failed"]:
@@ -371,18 +369,14 @@ def _only(context: typer.Context, mode: str, accepted: set[str]) -> None:
             raise ValueError(f"{flag} {rule}. Leave it out.")
 
 
-def _fit_lane_changes(
-    data: Path, out: Path, model: str | None, base: str | None, seed: int, file: options.FileOptions,
-    every: float, ahead: float, first_lane: str,
-) -> None:  # fmt: skip
+def _fit_lane_changes(data: Path, out: Path, file: options.FileOptions, changes: tuple[Any, ...]) -> None:
     with shown(console) as report:
         from idm_env.fitting.lane_changes import ChangeOptions, fit_lane_changes
         from idm_env.fitting.options import Source
 
         _work_begins()
-        options = ChangeOptions(model, base, every, ahead, first_lane, None, int(seed))
         source = Source(data, **dataclasses.asdict(file))
-        result = fit_lane_changes(source, options, out, on_progress=report)
+        result = fit_lane_changes(source, ChangeOptions(*changes), out, on_progress=report)
     shown_of = ("parameter", "symbol", "unit", "estimate", "standard_error", "identified")
     rows = [{n: row[n] for n in shown_of} for row in result["parameters"]]
     answers.show("MOBIL by the likelihood of lane changes", rows)
@@ -438,10 +432,9 @@ def explain(
                 return
         from idm_env.discovery.sets import Question, explain as explain_one, explain_sets
 
-        question = Question(
-            by, candidates, inputs, seed, file.ring_length, file.place, file.layout,
-            None if file.where is None else tuple(file.where), base or "idm", file.columns, seconds,
-        )  # fmt: skip
+        where = None if file.where is None else tuple(file.where)
+        request = by, candidates, inputs, seed, file.ring_length, file.place, file.layout
+        question = Question(*request, where, base or "idm", file.columns, seconds)
         _work_begins()
         rows: list[dict[str, Any]] = []
         if read is not None:

@@ -23,11 +23,10 @@ class Finding(NamedTuple):
 
 def findings(folder: Path = Path()) -> list[Finding]:
     """Return all findings; ``folder`` is where results would be written."""
-    return [
-        *_versions(), *(_extra(name) for name in EXTRAS), _kernels(), _threads(), _gpu(),
-        _cache("cache of printed steps", "IDM_ENV_CACHE"), _cache("compiled loops", "NUMBA_CACHE_DIR"),
-        _writable("results", folder, "Go to a folder that you may write to, or give --out one."),
-    ]  # fmt: skip
+    caches = {"cache of printed steps": "IDM_ENV_CACHE", "compiled loops": "NUMBA_CACHE_DIR"}
+    machine = [*_versions(), *(_extra(name) for name in EXTRAS), _kernels(), _threads(), _gpu()]
+    results = _writable("results", folder, "Go to a folder that you may write to, or give --out one.")
+    return [*machine, *(_cache(*pair) for pair in caches.items()), results]
 
 
 def _versions() -> list[Finding]:

@@ -179,12 +179,11 @@ def _for_typer(name: str, kind: Any, default: Any, meaning: str) -> Any:
 
 def _gathered(kind: Any, values: dict[str, Any]) -> Any:
     """Return a dataclass of the options that are its fields, which are taken out of ``values``."""
-    hints = get_type_hints(kind)
-    names = [field.name for field in dataclasses.fields(kind)]
-    return kind(**{
-        name: _gathered(hints[name], values) if dataclasses.is_dataclass(hints[name]) else values.pop(name)
-        for name in names
-    })  # fmt: skip
+    hints, options = get_type_hints(kind), {}
+    for name in (field.name for field in dataclasses.fields(kind)):
+        group = hints[name] if dataclasses.is_dataclass(hints[name]) else None
+        options[name] = values.pop(name) if group is None else _gathered(group, values)
+    return kind(**options)
 
 
 def spread(command: Callable[..., None]) -> Callable[..., None]:

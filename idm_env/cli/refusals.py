@@ -77,7 +77,7 @@ def refuse_whole(given: Mapping[str, Any]) -> None:
         return
     from tempfile import TemporaryDirectory
 
-    from idm_env.trajectories.spool import Spool
+    from idm_env.trajectories.spool import Reading, Spool
 
     with TemporaryDirectory() as folder:
-        Spool(path, Path(folder) / "spool", chunk=200, **options)
+        Spool(path, Path(folder) / "spool", 200, Reading(**options))

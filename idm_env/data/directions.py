@@ -74,10 +74,8 @@ def mirrored(frame: pl.DataFrame, vehicles: pl.DataFrame) -> pl.DataFrame:
     changes = [pl.when(turn).then(-pl.col("position_m")).otherwise(pl.col("position_m")).alias("position_m")]
     if "speed_mps" in frame.columns:
         signed = turn & (pl.col("speed_mps").median().over(TRACK) < 0)
-        changes += [
-            pl.when(signed).then(-pl.col(name)).otherwise(pl.col(name)).alias(name)
-            for name in ("speed_mps", "accel_mps2") if name in frame.columns
-        ]  # fmt: skip
+        motion = [name for name in ("speed_mps", "accel_mps2") if name in frame.columns]
+        changes += [pl.when(signed).then(-pl.col(name)).otherwise(pl.col(name)).alias(name) for name in motion]
     return renamed(other.with_columns(changes).drop("turn"), vehicles)
 
 

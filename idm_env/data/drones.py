@@ -17,6 +17,7 @@ I-24 MOTION   Gloudemans et al. 2023: JSON, one document per vehicle with arrays
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -107,10 +108,9 @@ def pneuma(path: Path) -> Read:
             continue
         _, _, speed, _, _, time = numbers.T
         kind = cells[1].lower()
-        parts.append(pl.DataFrame({
-            "vehicle_id": cells[0], "time_s": time, "speed_mps": speed / 3.6, "length_m": LENGTHS_M.get(kind, 5.0),
-            "position_m": _way(speed / 3.6, time, cells[2]), "vehicle_class": cells[1],
-        }))  # fmt: skip
+        columns: dict[str, Any] = {"vehicle_id": cells[0], "time_s": time, "speed_mps": speed / 3.6}
+        columns |= {"length_m": LENGTHS_M.get(kind, 5.0), "position_m": _way(speed / 3.6, time, cells[2])}
+        parts.append(pl.DataFrame({**columns, "vehicle_class": cells[1]}))
     if not parts:
         raise DataError(f"{path.name}: no line holds a track of pNEUMA's layout; is it the unzipped csv?")
     repairs = repaired("length assumed", len(parts), "vehicles have the nominal length of their type.")
@@ -149,11 +149,10 @@ def i24(path: Path) -> Read:
             time, x, y = (np.asarray(document[name], float) for name in ("timestamp", "x_position", "y_position"))
             length, name = float(np.median(document["length"])), document["_id"]
             name = str(name["$oid"] if isinstance(name, dict) else name)
-            parts.append(pl.DataFrame({
-                "run_id": "east" if direction > 0 else "west", "vehicle_id": name, "time_s": time,
-                "position_m": (direction * x + length) * FOOT_M, "length_m": length * FOOT_M,
-                "lane": np.floor(np.abs(y) / LANE_FT).astype(np.int64) + 1,
-            }))  # fmt: skip
+            names = {"run_id": "east" if direction > 0 else "west", "vehicle_id": name}
+            motion = {"time_s": time, "position_m": (direction * x + length) * FOOT_M, "length_m": length * FOOT_M}
+            lane = np.floor(np.abs(y) / LANE_FT).astype(np.int64) + 1
+            parts.append(pl.DataFrame({**names, **motion, "lane": lane}))
         except (KeyError, TypeError, ValueError, pl.exceptions.PolarsError):
             broken += 1
     if not parts:

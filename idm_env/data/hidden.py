@@ -34,17 +34,17 @@ class HiddenStrength:
     half: float
 
 
-_STRENGTHS = {
-    "delay": ("tau_s", 0.5, 0.25), "lag": ("tau_s", 0.5, 0.25), "second_leader": ("weight", 0.35, 0.175),
-    "leader_acceleration": ("gain", 0.4, 0.2), "brake_light": ("gain", 0.6, 0.3), "asymmetry": ("k", 0.3, 0.15),
-    "power_limit": ("watt_per_kg", 12.0, 18.0), "drag": ("per_m", 5e-4, 2.5e-4),
-    "speed_dependent_gap": ("s1_m", 5.0, 2.5), "memory": ("beta", 0.8, 0.4), "follower": ("gain", 0.15, 0.075),
-    "dead_zone": ("rad_per_s", 0.002, 0.001), "action_point": ("mps2", 0.3, 0.15),
-    "grade": ("steepest_slope", 0.04, 0.02), "speed_zone": ("factor", 0.6, 0.8), "regime_shift": ("k", 0.35, 0.175),
-    "lateral": ("per_s", 0.1, 0.05), "gap_bias": ("bias_m", 1.5, 0.75), "speed_time_gap": ("k", -0.4, -0.2),
-    "set_point_asymmetry": ("k", 0.2, 0.1), "relaxation": ("beta", 0.7, 0.35), "gap_stiffness": ("w", 0.5, 0.7),
-    "speed_profile": ("depth", 0.6, 0.4), "curve_speed": ("mps2", 2.0, 3.0), "leader_trend": ("kappa", 0.75, 0.87),
-}  # fmt: skip
+_STRENGTHS = {"delay": ("tau_s", 0.5, 0.25), "lag": ("tau_s", 0.5, 0.25), "second_leader": ("weight", 0.35, 0.175)}
+_STRENGTHS |= {"leader_acceleration": ("gain", 0.4, 0.2), "brake_light": ("gain", 0.6, 0.3)}
+_STRENGTHS |= {"asymmetry": ("k", 0.3, 0.15), "power_limit": ("watt_per_kg", 12.0, 18.0)}
+_STRENGTHS |= {"drag": ("per_m", 5e-4, 2.5e-4), "speed_dependent_gap": ("s1_m", 5.0, 2.5), "memory": ("beta", 0.8, 0.4)}
+_STRENGTHS |= {"follower": ("gain", 0.15, 0.075), "dead_zone": ("rad_per_s", 0.002, 0.001)}
+_STRENGTHS |= {"action_point": ("mps2", 0.3, 0.15), "grade": ("steepest_slope", 0.04, 0.02)}
+_STRENGTHS |= {"speed_zone": ("factor", 0.6, 0.8), "regime_shift": ("k", 0.35, 0.175), "lateral": ("per_s", 0.1, 0.05)}
+_STRENGTHS |= {"gap_bias": ("bias_m", 1.5, 0.75), "speed_time_gap": ("k", -0.4, -0.2)}
+_STRENGTHS |= {"set_point_asymmetry": ("k", 0.2, 0.1), "relaxation": ("beta", 0.7, 0.35)}
+_STRENGTHS |= {"gap_stiffness": ("w", 0.5, 0.7), "speed_profile": ("depth", 0.6, 0.4)}
+_STRENGTHS |= {"curve_speed": ("mps2", 2.0, 3.0), "leader_trend": ("kappa", 0.75, 0.87)}
 EFFECTS: dict[str, HiddenStrength] = {name: HiddenStrength(*row) for name, row in _STRENGTHS.items()}
 """Every effect of the catalogue. ``gap_bias`` changes the measured gap, not the motion."""
 

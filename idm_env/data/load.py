@@ -19,12 +19,10 @@ from idm_env.data.trajectories import Trajectories, parted
 
 LAYOUTS = ("auto", "tidy", "ngsim", "openacc", "ultra_av", *drones.CSV, *drones.FILES)
 EXTENSIONS = (".csv", ".csv.gz", ".parquet", *plain.ENDINGS)
-CURES = {
-    **dict.fromkeys((".xls", ".ods"), "save the sheet as csv"), ".mat": "in MATLAB, writetable saves csv",
-    **dict.fromkeys((".mf4", ".mdf", ".blf", ".asc", ".bag", ".mcap"), "export its signals as csv, as asammdf does"),
-    **dict.fromkeys((".h5", ".hdf5", ".pkl", ".feather", ".npz", ".zarr"), "in Python, pandas saves csv and parquet"),
-    ".gpx": "give the way along the road, as csv",
-}  # fmt: skip
+CURES = {".mat": "in MATLAB, writetable saves csv", ".gpx": "give the way along the road, as csv"}
+CURES |= dict.fromkeys((".xls", ".ods"), "save the sheet as csv")
+CURES |= dict.fromkeys((".mf4", ".mdf", ".blf", ".asc", ".bag", ".mcap"), "export its signals as csv, as asammdf does")
+CURES |= dict.fromkeys((".h5", ".hdf5", ".pkl", ".feather", ".npz", ".zarr"), "in Python, pandas saves csv and parquet")
 """What makes a file that is not read one that is, by its extension."""
 BATCH_BYTES, BATCH_ROWS = 16_000_000, 200_000
 """Text and rows that ``batches`` holds at a time."""

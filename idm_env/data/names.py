@@ -44,14 +44,12 @@ _X, _V, _SENSOR = (
     r"(v|vel|velocity|spd|speed)",
     r"(radar|lidar|sensor|acc|can|obj(ect)?|mobileye)?_?",
 )
-_WHO = {"follower": r"(f|fv|sv|fav|fol|foll|follower|following|ego|own|host|subject|self)",
-        "leader": r"(l|lv|pv|lead|leader|leading|preceding|front|target)"}  # fmt: skip
-PAIRS = {
-    **{f"{who}.{name}": rf"{what}_?{of}|{of}_?{what}" for who, of in _WHO.items()
-       for name, what in (("position_m", _X), ("speed_mps", _V), ("length_m", "(l|len|length)"))},
-    "gap_m": rf"{_SENSOR}(range|gap|dist|distance|spacing|space_?gap|clearance)(_?x)?",
-    "range_rate_mps": rf"{_SENSOR}(range_?rate|rel(ative)?_?{_V}|delta_?v|dv)",
-}  # fmt: skip
+_WHO = {"follower": r"(f|fv|sv|fav|fol|foll|follower|following|ego|own|host|subject|self)"}
+_WHO["leader"] = r"(l|lv|pv|lead|leader|leading|preceding|front|target)"
+_WHAT = {"position_m": _X, "speed_mps": _V, "length_m": "(l|len|length)"}
+PAIRS = {f"{who}.{name}": rf"{w}_?{of}|{of}_?{w}" for who, of in _WHO.items() for name, w in _WHAT.items()}
+PAIRS["gap_m"] = rf"{_SENSOR}(range|gap|dist|distance|spacing|space_?gap|clearance)(_?x)?"
+PAIRS["range_rate_mps"] = rf"{_SENSOR}(range_?rate|rel(ative)?_?{_V}|delta_?v|dv)"
 """The same of a table in which a row holds a follower and its leader."""
 
 Columns = Mapping[str, str] | str | None

@@ -95,10 +95,9 @@ def _track(
         times, rates = clock[good], speed[good]
         moved = np.concatenate([[0.0], np.cumsum(np.diff(times) * (rates[1:] + rates[:-1]) / 2)])
         position[good] = start + moved
-    extras = {
-        new: frame[names[key]].cast(pl.String) if key == "driver" else pl.Series(_numbers(frame, names[key]))
-        for key, new in _EXTRA.items() if key in names
-    }  # fmt: skip
+    extras = {_EXTRA[key]: pl.Series(_numbers(frame, names[key])) for key in _EXTRA if key in names and key != "driver"}
+    if "driver" in names:
+        extras[_EXTRA["driver"]] = frame[names["driver"]].cast(pl.String)
     columns = {"time_s": clock, "position_m": position, "speed_mps": speed, **extras}
     return pl.DataFrame(columns).with_columns(pl.col(pl.Float64).exclude("time_s", "position_m").fill_nan(None))
 

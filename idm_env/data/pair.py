@@ -59,10 +59,9 @@ def read(frame: pl.DataFrame, columns: Columns, source: str) -> tuple[pl.DataFra
     ids = pl.coalesce("leader.vehicle_id", pl.format("{} leader", own), pl.lit("leader")).cast(pl.String)
     table = table.with_columns(lead=pl.coalesce("leader.position_m", ahead), own=own.fill_null("follower"), id=ids)
     shared = ["run_id", "time_s", "lane"]
-    follower = table.select(
-        *shared, vehicle_id="own", leader_id=pl.when(pl.col("lead").is_not_null()).then("id"), position_m="way",
-        speed_mps=speed, length_m="follower.length_m", gap_m="gap_m",
-    )  # fmt: skip
+    leads = pl.when(pl.col("lead").is_not_null()).then("id")
+    motion = {"position_m": "way", "speed_mps": speed, "length_m": "follower.length_m", "gap_m": "gap_m"}
+    follower = table.select(*shared, vehicle_id="own", leader_id=leads, **motion)  # type: ignore[arg-type]
     rate = pl.coalesce("leader.speed_mps", speed + pl.col("range_rate_mps"))
     leader = table.filter(pl.col("lead").is_not_null()).select(
         *shared, vehicle_id="id", position_m="lead", speed_mps=rate, length_m="leader.length_m"

@@ -53,12 +53,11 @@ def split_runs(trajectories: Trajectories, seconds: float) -> Trajectories:
     pieces = trajectories.table.with_columns(pl.col("run_id").alias("_run"), passed.floor().alias("_piece"))
     begin = (pl.col("_piece") * seconds).round(3).cast(pl.String).str.strip_suffix(".0")
     pieces = pieces.with_columns(pl.format("{}@{}s", "run_id", begin).alias("run_id"))
-    home = (
-        pieces.join(_fitted_drivers(trajectories), left_on=["_run", "vehicle_id"], right_on=schema.TRACK, how="semi")
-        .group_by("_run", "vehicle_id", "_piece", "run_id").len()
-        .sort("_run", "vehicle_id", "len", "_piece", descending=[False, False, True, False])
-        .unique(["_run", "vehicle_id"], keep="first", maintain_order=True)
-    )  # fmt: skip
+    drivers, track = _fitted_drivers(trajectories), ["_run", "vehicle_id"]
+    home = pieces.join(drivers, left_on=track, right_on=schema.TRACK, how="semi")
+    home = home.group_by(*track, "_piece", "run_id").len()
+    home = home.sort(*track, "len", "_piece", descending=[False, False, True, False])
+    home = home.unique(track, keep="first", maintain_order=True)
     count = home["run_id"].n_unique()
     if count < LEAST_PIECES:
         raise DataError(

@@ -50,13 +50,11 @@ class Samples:
             return np.concatenate([getattr(e, field) for e in items]).astype(float)
 
         adjacent = [(e.adjacent.position_m - e.position_m, e.adjacent.speed_mps, e.adjacent.present) for e in items]
-        return cls(
-            items, dt, np.append(0, np.cumsum([len(e) for e in items])),
-            four("position_m"), four("speed_mps"), four("accel_mps2"), four("present"),
-            np.concatenate([np.stack(columns, axis=1) for columns in adjacent]),
-            one("gap_m"), one("time_s"), one("place_m"),
-            np.array([[record.length_m for record in each] for each in around], float),
-        )  # fmt: skip
+        bounds = np.append(0, np.cumsum([len(e) for e in items]))
+        motion = four("position_m"), four("speed_mps"), four("accel_mps2"), four("present")
+        adjacent_lane = np.concatenate([np.stack(columns, axis=1) for columns in adjacent])
+        length = np.array([[record.length_m for record in each] for each in around], float)
+        return cls(items, dt, bounds, *motion, adjacent_lane, one("gap_m"), one("time_s"), one("place_m"), length)
 
     @property
     def lengths(self) -> np.ndarray:

@@ -33,6 +33,8 @@ SHORTEST_TRACK_S = 5.0
 
 
 _ANY, _FINITE = (pl.lit(True), ""), (lambda name: (pl.col(name).is_finite(), "finite"))
+_SPEED = pl.col("speed_mps").is_between(LOWEST_SPEED_MPS, HIGHEST_SPEED_MPS)
+_LENGTH = pl.col("length_m").is_between(0.0, LONGEST_LENGTH_M, closed="right")
 COLUMNS: dict[str, tuple[Any, bool, pl.Expr, str]] = {
     "run_id": (pl.String, True, *_ANY),
     "vehicle_id": (pl.String, True, *_ANY),
@@ -40,17 +42,11 @@ COLUMNS: dict[str, tuple[Any, bool, pl.Expr, str]] = {
     "lane": (pl.Int64, False, *_ANY),
     "time_s": (pl.Float64, True, *_FINITE("time_s")),
     "position_m": (pl.Float64, True, *_FINITE("position_m")),
-    "speed_mps": (
-        pl.Float64, True, pl.col("speed_mps").is_between(LOWEST_SPEED_MPS, HIGHEST_SPEED_MPS),
-        f"{LOWEST_SPEED_MPS:g} to {HIGHEST_SPEED_MPS:g} m/s",
-    ),
-    "length_m": (
-        pl.Float64, True, pl.col("length_m").is_between(0.0, LONGEST_LENGTH_M, closed="right"),
-        f"above 0, up to {LONGEST_LENGTH_M:g} m",
-    ),
+    "speed_mps": (pl.Float64, True, _SPEED, f"{LOWEST_SPEED_MPS:g} to {HIGHEST_SPEED_MPS:g} m/s"),
+    "length_m": (pl.Float64, True, _LENGTH, f"above 0, up to {LONGEST_LENGTH_M:g} m"),
     "gap_m": (pl.Float64, False, *_FINITE("gap_m")),
     "gap_measured": (pl.Boolean, True, *_ANY),
-}  # fmt: skip
+}
 """Columns of the tidy table: type, whether every row has a value, what holds of every value, and how that is said."""
 
 

@@ -5,10 +5,10 @@ import polars as pl
 from idm_env.data.errors import DataError, Repair, listed
 from idm_env.data.names import SHORT, UNITS, guessed
 
+_OTHER = {name: {u: x for u, x in units.items() if x != 1.0 and u.isalpha()} for name, units in UNITS.items()}
 NAMED: dict[str, tuple[tuple[str, float], ...]] = {
-    name: tuple((f"{stem}_{unit}", factor) for unit, factor in UNITS[name].items() if factor != 1.0 and unit.isalpha())
-    for stem, name in SHORT.items() if name in UNITS
-}  # fmt: skip
+    name: tuple((f"{stem}_{u}", x) for u, x in _OTHER[name].items()) for stem, name in SHORT.items() if name in UNITS
+}
 """Columns that name another unit, such as ``position_ft``, and what they are multiplied by."""
 _OTHER_UNITS = {other for others in NAMED.values() for other, _ in others}
 

@@ -34,12 +34,11 @@ def read(frame: pl.DataFrame, source: str = "table") -> tuple[pl.DataFrame, list
     def track(which: str, vehicle: str, leader: str | None, gap: pl.Expr) -> pl.DataFrame:
         name = f"id_{which}"
         named = pl.col(name).cast(pl.String) if name in frame.columns else pl.lit(vehicle)
-        return frame.select(
-            pl.col("trajectory_id").cast(pl.String).alias("run_id"), pl.lit(vehicle).alias("vehicle_id"),
-            pl.lit(leader, pl.String).alias("leader_id"), named.alias("vehicle_name"), lane=pl.lit(1),
-            time_s=pl.col("time_index"), position_m=pl.col(f"pos_{which}") + length.fill_null(0.0) / 2,
-            speed_mps=pl.col(f"speed_{which}"), length_m=length, gap_m=gap.cast(pl.Float64),
-        )  # fmt: skip
+        names = {"run_id": pl.col("trajectory_id").cast(pl.String), "vehicle_id": pl.lit(vehicle)}
+        names |= {"leader_id": pl.lit(leader, pl.String), "vehicle_name": named, "lane": pl.lit(1)}
+        motion = {"time_s": pl.col("time_index"), "position_m": pl.col(f"pos_{which}") + length.fill_null(0.0) / 2}
+        motion |= {"speed_mps": pl.col(f"speed_{which}"), "length_m": length, "gap_m": gap.cast(pl.Float64)}
+        return frame.select(**names, **motion)
 
     both = [track("lv", "1", None, pl.lit(None, pl.Float64)), track("fav", "2", "1", gap)]
     return pl.concat(both), []

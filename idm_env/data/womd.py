@@ -16,9 +16,8 @@ from idm_env.data.errors import DataError
 from idm_env.data.scenario import PRESENT, SHOWN, Agent, MapLane, Scenario, TrafficControl, check_scenario
 from idm_env.data.sizes import read_whole, unpacked
 
-_STATES = (
-    "unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go", "flashing_stop", "flashing_caution",
-)  # fmt: skip
+_STATES: tuple[str, ...] = ("unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go")
+_STATES += ("flashing_stop", "flashing_caution")
 
 
 def scenarios(path: str | Path) -> Iterator[Scenario]:

@@ -50,10 +50,8 @@ def messages() -> dict[str, Any]:
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
     kinds = descriptor_pb2.FieldDescriptorProto
-    scalars = {
-        "double": kinds.TYPE_DOUBLE, "float": kinds.TYPE_FLOAT, "int32": kinds.TYPE_INT32, "int64": kinds.TYPE_INT64,
-        "bool": kinds.TYPE_BOOL, "string": kinds.TYPE_STRING,
-    }  # fmt: skip
+    names = ("double", "float", "int32", "int64", "bool", "string")
+    scalars = {name: getattr(kinds, f"TYPE_{name.upper()}") for name in names}
     file = descriptor_pb2.FileDescriptorProto(name="idm_env/scenario.proto", package="idm_env.womd", syntax="proto2")
     for name, fields in MESSAGES.items():
         message = file.message_type.add(name=name)
@@ -174,7 +172,5 @@ def _agent(track: Any) -> Agent:
     rows = np.array([[s.center_x, s.center_y, s.heading, s.velocity_x, s.velocity_y] for s in states]).reshape(-1, 5)
     valid = np.array([s.valid for s in states], bool) & np.isfinite(rows).all(1)
     size = next((s for s, good in zip(states, valid, strict=True) if good), None)
-    return Agent(
-        int(track.id), _KIND.get(track.object_type, "other"), float(size.length if size else 4.5),
-        float(size.width if size else 2.0), rows[:, :2], rows[:, 2], rows[:, 3:], valid,
-    )  # fmt: skip
+    kind, box = _KIND.get(track.object_type, "other"), (size.length, size.width) if size else (4.5, 2.0)
+    return Agent(int(track.id), kind, float(box[0]), float(box[1]), rows[:, :2], rows[:, 2], rows[:, 3:], valid)

@@ -5,7 +5,7 @@ One of them is there once more, with the strengths of effects that are each driv
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from idm_env.discovery import model as terms
 from idm_env.discovery.compare import Comparison, ErrorChange, compare
@@ -16,6 +16,8 @@ from idm_env.discovery.result import Against, LawErrors
 from idm_env.discovery.verdict import improves, mean_ratio
 from idm_env.effects import ALL, BASES, CarFollowing, base_named, make
 
+OnLaw = Callable[[int, int, str], None]
+"""Called with how many laws are done, of how many, and the name of the last."""
 LEAST = 0.03
 """Least fall of the geometric mean of the errors for which a law is named first: it is chosen among several."""
 
@@ -72,9 +74,8 @@ class Law(NamedTuple):
 
 
 def compared(
-    null: Hypothesis, first: Judged, judged: Callable[[Hypothesis], Judged], seed: int,
-    on_law: Callable[[int, int, str], None],
-) -> list[Law]:  # fmt: skip
+    null: Hypothesis, first: Judged, judged: Callable[[Hypothesis], Judged], seed: int, on_law: OnLaw
+) -> list[Law]:
     """Return all laws, that of the null first.
 
     Args:
@@ -126,14 +127,13 @@ def best_of(laws: Iterable[Law]) -> Law:
 
 def rows(laws: Iterable[Law]) -> list[LawErrors]:
     """Return the rows of a report's table of laws."""
-    return [
-        LawErrors(
-            each.law.kind, each.title, each.law.equation, list(each.own), list(each.model.catalogue.without),
-            each.parameters, {name: n for name, n in each.at_bounds.items() if n},
-            **each.errors.summary(), against=against_rows(each.against),
-        )
-        for each in laws
-    ]  # fmt: skip
+    rows = []
+    for each in laws:
+        names = each.law.kind, each.title, each.law.equation, list(each.own), list(each.model.catalogue.without)
+        bounds = {name: n for name, n in each.at_bounds.items() if n}
+        errors: Any = each.errors.summary()
+        rows.append(LawErrors(*names, each.parameters, bounds, **errors, against=against_rows(each.against)))
+    return rows
 
 
 def against_rows(against: Mapping[str, Comparison]) -> dict[str, Against]:

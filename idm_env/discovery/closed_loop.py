@@ -102,11 +102,10 @@ def evaluate(
     meters = linearise(replace(problem, rows=rows, sigma=1.0), frozen, fitted.theta, np.zeros(0))
     of_row = (meters.residual**2 * scored).sum(1) / np.maximum(scored.sum(1), 1)
     usual = max(float(np.median(of_row)), 1e-6)
-    return ClosedLoopFit(
-        replace(problem, rows=rows), scored, model, values, fitted.theta, meters,
-        np.linalg.inv(matrix + 1e-9 * np.eye(matrix.shape[-1])), 1.0 / (of_row + usual), units(records, MANY_RUNS),
-        {seconds: float(np.sqrt(square[seconds])) for seconds in sorted(square)},
-    )  # fmt: skip
+    fit = replace(problem, rows=rows), scored, model, values, fitted.theta, meters
+    inverse, weight = np.linalg.inv(matrix + 1e-9 * np.eye(matrix.shape[-1])), 1.0 / (of_row + usual)
+    sizes = {seconds: float(np.sqrt(square[seconds])) for seconds in sorted(square)}
+    return ClosedLoopFit(*fit, inverse, weight, units(records, MANY_RUNS), sizes)
 
 
 def further(square: dict[float, float]) -> Sequence[float]:

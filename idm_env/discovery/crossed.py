@@ -90,9 +90,9 @@ def crossed(
     halves = [replace(rows, valid=part).settled() for part in (rows.valid & ~second, second)]
     middle = model.fixed(values.mean(0))
     # Where every driver is the population's middle, no driver needs to be fitted to half of his time.
-    near = np.stack([theta, theta]) if pooled else np.stack([
-        solve(replace(problem, rows=half), middle, theta, EMPTY, iterations=10, tolerance=1e-4).theta for half in halves
-    ])  # fmt: skip
+    apart = [] if pooled else [replace(problem, rows=half) for half in halves]
+    ends = [solve(half, middle, theta, EMPTY, iterations=10, tolerance=1e-4).theta for half in apart]
+    near = np.stack(ends or [theta, theta])
     of_row = fold[rows.run]
     parts: dict[int, _Fold] = {}
     for k in np.unique(of_row):
@@ -187,10 +187,9 @@ def _whitened(
         mine = fold[rows.run] == k
         prior = replace(population(all_time, rows.some(~mine), model.catalogue.own), centre_follows=False)
         own = replace(free, prior=prior)
-        thetas[int(k)] = np.stack([
-            solve(own.of_rows(mine & half), model.fixed(values[k]), all_time, EMPTY, iterations=10).theta
-            for half in (~second, second)
-        ])  # fmt: skip
+        parts = [own.of_rows(mine & half) for half in (~second, second)]
+        ends = [solve(part, model.fixed(values[k]), all_time, EMPTY, iterations=10) for part in parts]
+        thetas[int(k)] = np.stack([end.theta for end in ends])
     return thetas
 
 

@@ -81,7 +81,7 @@ Searched = Callable[[Hypothesis, str, judge.Judged | None], tuple[Evaluation, De
 
 def finished(
     trajectories: Trajectories, evaluation: Evaluation, decided: Decided, refused: dict[str, str], by: str,
-    on_law: Callable[[int, int, str], None], searched: Searched,
+    on_law: bases.OnLaw, searched: Searched,
 ) -> Discovery:  # fmt: skip
     """Return what is said of what was decided.
 
@@ -121,18 +121,14 @@ def finished(
             leading = decided.rounds[0].leading
             noisy, agreements = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
             errors = replica.ahead(everywhere[0], everywhere[1].theta, noisy.model)
-            ladder = replace(
-                ladder, agreement=agreements["scene"], tails=agreements["tails"], leading=agreements.get("leading"),
-                worst=tails.worst(everywhere[0].rows, errors),
-                unsteady=(float(np.median(noisy.sigma)), noisy.memory_s),
-            )  # fmt: skip
+            worst, unsteady = tails.worst(everywhere[0].rows, errors), (float(np.median(noisy.sigma)), noisy.memory_s)
+            ladder = replace(ladder, agreement=agreements["scene"], tails=agreements["tails"], worst=worst)
+            ladder = replace(ladder, leading=agreements.get("leading"), unsteady=unsteady)
         judgement = replace(judgement, ladder=ladder)
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
-    result = summary.summarise(
-        trajectories, evaluation, decided, judgement, laws, (first, last, of_law), floor,
-        refused | evaluation.searching.unplaced, by,
-        ceilings.ceilings_of(decided.null_in_closed_loop, scored, null, decided.rounds[0].smooth_gain),
-    )  # fmt: skip
+    limits = ceilings.ceilings_of(decided.null_in_closed_loop, scored, null, decided.rounds[0].smooth_gain)
+    judged = trajectories, evaluation, decided, judgement, laws, (first, last, of_law), floor
+    result = summary.summarise(*judged, refused | evaluation.searching.unplaced, by, limits)
     saved = _saved(trajectories, evaluation, judgement, of_laws, (first, last, of_law), by)
     models = dict(zip(judgement.names(), saved, strict=True))
     shown = null if judgement.compared is None else judgement.compared

@@ -170,10 +170,8 @@ def _logs(judged: Judged) -> np.ndarray:
     result = []
     for half in (False, True):
         valid = judged.rows.valid & (samples == half)
-        part = Judged(
-            replace(judged.rows, valid=valid), judged.gap, judged.speed, judged.ahead[ahead == half],
-            judged.ahead_record[ahead == half],
-        )  # fmt: skip
+        soon = judged.ahead[ahead == half], judged.ahead_record[ahead == half]
+        part = Judged(replace(judged.rows, valid=valid), judged.gap, judged.speed, *soon)
         squares = [part.squares[key] for key in ERRORS]
         result.append(np.mean([0.5 * np.log((s + 1e-9) / np.maximum(n, 1)) for s, n in squares], axis=0))
     return np.stack(result)
@@ -185,10 +183,8 @@ def _mixed(halves: Sequence[Judged]) -> Judged:
     samples, ahead = _seconds(first)
     longer = in_blocks(first.rows.records)
     further = first.further if longer is None else np.where(longer.block % 2 == 1, second.further, first.further)
-    return replace(
-        first, gap=np.where(samples, second.gap, first.gap), speed=np.where(samples, second.speed, first.speed),
-        ahead=np.where(ahead, second.ahead, first.ahead), further=further,
-    )  # fmt: skip
+    gap, speed = np.where(samples, second.gap, first.gap), np.where(samples, second.speed, first.speed)
+    return replace(first, gap=gap, speed=speed, ahead=np.where(ahead, second.ahead, first.ahead), further=further)
 
 
 def told(fleet: Kinds) -> result.Fleet:

@@ -46,8 +46,6 @@ def _class(term: Term, estimates: Mapping[str, ParameterEstimate]) -> dict[str, 
     first, distance, count = term.drawn
     heights = ", ".join(("0.0 * x", *(f'p["{p.name}"]' for p in term.parameters), "0.0 * x"))
     factors = ", ".join(f"{n}=driver.{n} * (1.0 + c)" for n in TARGETS.get(term.what, ()))
-    return {
-        "term": term, "name": _name(term), "kind": _kind(term), "estimates": estimates, "heights": heights,
-        "changed": CHANGES[term.what], "along": ALONG, "units": FEATURES, "per": PER, "factors": factors,
-        "knots": tuple(float(f"{first + distance * i:.8g}") for i in range(count)),
-    }  # fmt: skip
+    own = {"term": term, "name": _name(term), "kind": _kind(term), "estimates": estimates, "heights": heights}
+    own |= {"changed": CHANGES[term.what], "along": ALONG, "units": FEATURES, "per": PER, "factors": factors}
+    return own | {"knots": tuple(float(f"{first + distance * i:.8g}") for i in range(count))}

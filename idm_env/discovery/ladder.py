@@ -252,8 +252,8 @@ def _scene(rows: Rows) -> np.ndarray:
     later = [np.minimum(begin + round(share * rows.steps), len(leader) - 1) for share in (0.2, 0.5, 1.0)]
     ahead = [leader[sample] - leader[begin] for sample in later]
     usual = headway - by_group(rows, headway)
-    return np.stack([speed, headway, usual, speed - leader[begin], records.column("lead_accel")[begin],
-                     np.log1p(gap.clip(0)), *ahead], axis=1)  # fmt: skip
+    own = speed, headway, usual, speed - leader[begin], records.column("lead_accel")[begin], np.log1p(gap.clip(0))
+    return np.stack([*own, *ahead], axis=1)
 
 
 def _past(rows: Rows) -> np.ndarray:

@@ -46,22 +46,21 @@ PULSE, PAST = "pulse", "past"
 PULSED = ("acceleration", "time_gap", "desired_speed", "accel_and_decel")
 """What a short pulse can change."""
 
-COLUMNS = (
-    "lead_rear", "lead_speed", "lead_accel", "second_rear", "second_speed", "second_accel", "second_present",
-    "behind_front", "behind_speed", "behind_accel", "behind_present", "beside_distance", "beside_speed",
-    "beside_present", "position", "speed", "accel", "time", "place", "pushed",
-)  # fmt: skip
+COLUMNS: tuple[str, ...] = ("lead_rear", "lead_speed", "lead_accel")
+COLUMNS += ("second_rear", "second_speed", "second_accel", "second_present")
+COLUMNS += ("behind_front", "behind_speed", "behind_accel", "behind_present")
+COLUMNS += ("beside_distance", "beside_speed", "beside_present")
+COLUMNS += ("position", "speed", "accel", "time", "place", "pushed")
 
-_SEEN: dict[Leaf, str] = {
-    Leaf("position"): "place", Leaf("speed"): "speed", Leaf("accel"): "accel", Leaf("gap"): "gap",
-    Leaf("length"): "own_length", Leaf("step"): "(time * per_dt)",
-    Leaf("led"): "1.0", Leaf("speed", 1): "lead_speed", Leaf("accel", 1): "lead_accel",
-    # A gap to the second leader is counted from the leader's rear, whose length is then not needed.
-    Leaf("led", 1): "signals[i, 6]", Leaf("length", 1): "0.0", Leaf("gap", 1): "(signals[i, 3] - signals[i, 0])",
-    Leaf("speed", 2): "signals[i, 4]", Leaf("accel", 2): "signals[i, 5]",
-    Leaf("leads"): "signals[i, 10]", Leaf("led", -1): "1.0", Leaf("gap", -1): "(position - own_length - signals[i, 7])",
-    Leaf("speed", -1): "signals[i, 8]", Leaf("accel", -1): "signals[i, 9]",
-}  # fmt: skip
+_SEEN: dict[Leaf, str] = {Leaf("position"): "place", **{Leaf(name): name for name in ("speed", "accel", "gap")}}
+_SEEN |= {Leaf("length"): "own_length", Leaf("step"): "(time * per_dt)", Leaf("led"): "1.0"}
+_SEEN |= {Leaf("speed", 1): "lead_speed", Leaf("accel", 1): "lead_accel", Leaf("led", 1): "signals[i, 6]"}
+# A gap to the second leader is counted from the leader's rear, whose length is then not needed.
+_SEEN |= {Leaf("length", 1): "0.0", Leaf("gap", 1): "(signals[i, 3] - signals[i, 0])"}
+_SEEN |= {Leaf("speed", 2): "signals[i, 4]", Leaf("accel", 2): "signals[i, 5]"}
+_SEEN |= {Leaf("leads"): "signals[i, 10]", Leaf("led", -1): "1.0"}
+_SEEN |= {Leaf("gap", -1): "(position - own_length - signals[i, 7])"}
+_SEEN |= {Leaf("speed", -1): "signals[i, 8]", Leaf("accel", -1): "signals[i, 9]"}
 """Where the loop has what a step reads."""
 _BESIDE = {"distance": "signals[i, 11]", "speed": "signals[i, 12]", "present": "signals[i, 13]"}
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import accumulate, product
+from typing import Any
 
 import numpy as np
 
@@ -191,12 +192,10 @@ class Hypothesis:
 
 SPREAD = 0.3
 """Prior width of a curve's knots, in units of what it changes: m/s², or relative."""
-STATES = {
-    "speed": 3.0, "gap": 4.0, "closing_speed": 1.0, "lead_accel": 0.4, "relative_gap": 0.2, "time_since_stop": 10.0,
-    "mean_speed_20s": 3.0, "mean_speed_90s": 3.0, "braking_15s": 0.4, "lead_braking_15s": 0.4,
-    "own_accel": 0.4, "lead_trend": 1.0, "lead_change_3s": 1.0, "headway_behind": 0.5, "gap_behind": 4.0,
-    "second_opening": 0.7,
-}  # fmt: skip
+STATES = {"speed": 3.0, "gap": 4.0, "closing_speed": 1.0, "lead_accel": 0.4, "relative_gap": 0.2}
+STATES |= {"time_since_stop": 10.0, "mean_speed_20s": 3.0, "mean_speed_90s": 3.0}
+STATES |= {"braking_15s": 0.4, "lead_braking_15s": 0.4, "own_accel": 0.4, "lead_trend": 1.0, "lead_change_3s": 1.0}
+STATES |= {"headway_behind": 0.5, "gap_behind": 4.0, "second_opening": 0.7}
 """Coordinates of the state, with the distance of a curve's knots: it ends where nobody was seen."""
 EDGES = {"position": 5.0, "time": 0.5, "speed": 0.5, "gap": 1.0, "closing_speed": 0.2, "lead_accel": 0.1}
 """Half-width over which an interval of a located effect sets in."""
@@ -235,9 +234,8 @@ def placed(effect: str | Effect, *values: float, period: float = 0.0) -> Term:
     """Return the term of an effect that acts in one interval of places or from one moment on: strength, then places."""
     one = catalogue.make(effect) if isinstance(effect, str) else effect
     coordinate = {"interval": "position", "step": "time"}[one.sought]
-    return Term(
-        one.name, one.name, one.parameters, (values,), what=one.acts_on, coordinate=coordinate, period=period, made=one,
-    )  # fmt: skip
+    where: dict[str, Any] = {"what": one.acts_on, "coordinate": coordinate, "period": period}
+    return Term(one.name, one.name, one.parameters, (values,), made=one, **where)
 
 
 def unknown_profile(effect: str | Effect, first: float, distance: float, count: int, period: float) -> Term:
@@ -246,10 +244,9 @@ def unknown_profile(effect: str | Effect, first: float, distance: float, count: 
     knots = tuple(first + distance * i for i in range(count))
     declared = replace(one, knots=knots).parameters  # type: ignore[call-arg]
     parameters = tuple(replace(p, default=0.0) for p in declared)
-    return Term(
-        one.name, one.name, parameters, ((0.0,) * count,), what=one.acts_on, coordinate="position", form=march.CURVE,
-        knots=(first, distance, count), period=period, smoothness=abs(one.strength_of(SPREAD)), made=one,
-    )  # fmt: skip
+    shape: dict[str, Any] = {"what": one.acts_on, "coordinate": "position", "form": march.CURVE, "period": period}
+    shape |= {"knots": (first, distance, count), "smoothness": abs(one.strength_of(SPREAD))}
+    return Term(one.name, one.name, parameters, ((0.0,) * count,), made=one, **shape)
 
 
 def known_profile(effect: str | Effect, first: float, distance: float, profile: Sequence[float], period: float) -> Term:
@@ -258,10 +255,9 @@ def known_profile(effect: str | Effect, first: float, distance: float, profile: 
     kind = effect if isinstance(effect, str) else effect.kind
     one = catalogue.make(kind, knots=places, profile=tuple(profile))
     starts = tuple(product(*(_starts(p) for p in one.parameters)))
-    return Term(
-        one.name, one.name, one.parameters, starts, what="share", coordinate="position", form=march.CURVE,
-        knots=(first, distance, len(profile)), period=period, profile=tuple(profile), made=one,
-    )  # fmt: skip
+    shape: dict[str, Any] = {"what": "share", "coordinate": "position", "form": march.CURVE, "period": period}
+    shape |= {"knots": (first, distance, len(profile)), "profile": tuple(profile)}
+    return Term(one.name, one.name, one.parameters, starts, made=one, **shape)
 
 
 def given_profile(effect: Effect) -> Term:
@@ -286,10 +282,8 @@ def interval(what: str, coordinate: str, begin: float, end: float, amount: float
         Parameter("begin", "x1", along, 0.0, -1e7, 1e7, role="place"),
         Parameter("end", "x2", along, 1.0, -1e7, 1e7, role="place"),
     )
-    return Term(
-        f"{what} over {coordinate}", None, parameters, ((amount, begin, end),), what=what, coordinate=coordinate,
-        form=march.INTERVAL, period=period,
-    )  # fmt: skip
+    where: dict[str, Any] = {"what": what, "coordinate": coordinate, "form": march.INTERVAL, "period": period}
+    return Term(f"{what} over {coordinate}", None, parameters, ((amount, begin, end),), **where)
 
 
 def curve(
@@ -305,13 +299,10 @@ def curve(
     unit = "m/s²" if what == "acceleration" else "1"
     size = (-5.0, 5.0) if what == "acceleration" else (-0.9, 3.0)
     parameters = tuple(Parameter(f"knot_{i}", f"c{i}", unit, 0.0, *size, null=0.0) for i in range(count))
-    return Term(
-        label, None, parameters, ((0.0,) * count,), what=what,
-        coordinate=coordinate, form=march.CURVE, knots=(first, distance, count), period=period,
-        smoothness=0.3 if what == "acceleration" else 0.5, fades=coordinate in STATES,
-        by=by,
-        pinned=nearest,
-    )  # fmt: skip
+    where: dict[str, Any] = {"what": what, "coordinate": coordinate, "period": period, "by": by}
+    where |= {"form": march.CURVE, "knots": (first, distance, count), "pinned": nearest}
+    soft = 0.3 if what == "acceleration" else 0.5
+    return Term(label, None, parameters, ((0.0,) * count,), smoothness=soft, fades=coordinate in STATES, **where)
 
 
 NEIGHBOURS = {"second leader": "second", "vehicle behind": "behind", "vehicle in an adjacent lane": "beside"}

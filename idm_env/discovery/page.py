@@ -5,6 +5,7 @@ Its words stand in ``report.html``.
 
 import math
 from pathlib import Path
+from typing import Any
 
 from idm_env.discovery import pictures, words
 from idm_env.discovery.finish import Discovery
@@ -32,25 +33,20 @@ def write(path: Path, d: Discovery) -> None:
     """Write the page."""
     r, judgement, law = d.result, d.judgement, d.null.model.catalogue.base.title
     before = r.error.before
-    pages.write_page(
-        path, _title(r).format(law=law), template=Path(__file__).with_name("report.html"),
-        filters={
-            "number": number, "percent": percent, "change": change, "changes": changes, "ends": _ends,
-            "plain": words.plain, "amount": words.amount,
-            "shares": lambda parts: " · ".join(f"{name} {percent(share)}" for name, share in parts.items()),
-        },
-        r=r, law=law, titles=judgement.titles, cards=cards(r, law), d=d, draw=pictures,
-        picture=pages.picture, error_names=words.ERRORS, most=words.MANY, shortened=pages.shortened,
-        rows=words.error_rows(d.report, list(judgement.results)),
-        declared={p.name: p for p in d.null.model.catalogue.own}, weight=words.weight(r.prior),
-        ceilings="" if before is None
-        else words.ceilings(r.ceilings, before["gap_rmse_m"], r.error.floor["gap_rmse_m"]),
-        rules={
-            "enough_runs": ENOUGH_RUNS, "many_runs": MANY_RUNS, "free_share": f"{CLOSED_LOOP_SHARE:.0%}",
-            "level": percent(ALPHA), "least_gain": percent(LEAST_GAIN, 1), "least_share": percent(LEAST_SHARE),
-            "holds": f"{HOLDS - 1.0:.0%}",
-        },
-    )  # fmt: skip
+    filters: dict[str, Any] = {"number": number, "percent": percent, "change": change, "changes": changes}
+    filters |= {"ends": _ends, "plain": words.plain, "amount": words.amount}
+    filters["shares"] = lambda parts: " · ".join(f"{name} {percent(share)}" for name, share in parts.items())
+    rules = {"enough_runs": ENOUGH_RUNS, "many_runs": MANY_RUNS, "free_share": f"{CLOSED_LOOP_SHARE:.0%}"}
+    rules |= {"level": percent(ALPHA), "least_gain": percent(LEAST_GAIN, 1), "least_share": percent(LEAST_SHARE)}
+    names: dict[str, Any] = {"r": r, "d": d, "law": law, "rules": rules | {"holds": f"{HOLDS - 1.0:.0%}"}}
+    names |= {"titles": judgement.titles, "cards": cards(r, law), "draw": pictures, "picture": pages.picture}
+    names |= {"error_names": words.ERRORS, "most": words.MANY, "shortened": pages.shortened}
+    names |= {"rows": words.error_rows(d.report, list(judgement.results)), "weight": words.weight(r.prior)}
+    names["declared"] = {p.name: p for p in d.null.model.catalogue.own}
+    floor = r.error.floor["gap_rmse_m"]
+    names["ceilings"] = "" if before is None else words.ceilings(r.ceilings, before["gap_rmse_m"], floor)
+    template = Path(__file__).with_name("report.html")
+    pages.write_page(path, _title(r).format(law=law), template=template, filters=filters, **names)
 
 
 def _title(r: Result) -> str:
@@ -120,14 +116,12 @@ def cards(r: Result, law: str) -> list[tuple[str, str, str]]:
             for key, a in better.items()
         ] + _later(r)
     if r.helps:
-        return _later(r) + [
-            (
-                words.ERRORS[key][0].capitalize(), h.verdict,
-                f"{number(h.before)} → {number(h.after)} {h.unit}, {change(h.ratio)}"
-                + (f" ({changes(h, ' to ')})" if math.isfinite(h.high) else ""),
-            )
-            for key, h in r.helps.items()
-        ]  # fmt: skip
+        rows = _later(r)
+        for key, h in r.helps.items():
+            interval = f" ({changes(h, ' to ')})" if math.isfinite(h.high) else ""
+            size = f"{number(h.before)} → {number(h.after)} {h.unit}, {change(h.ratio)}{interval}"
+            rows.append((words.ERRORS[key][0].capitalize(), h.verdict, size))
+        return rows
     facts = [("Runs", f"{r.data.runs}, of them {r.data.runs_to_choose_on} for model selection")]
     if r.verdict == Verdict.CANNOT_TELL.value:
         facts.append(("What to do", "record more runs: seven decide, ten are better"))
@@ -135,6 +129,7 @@ def cards(r: Result, law: str) -> list[tuple[str, str, str]]:
         facts.append(("Where", f"run {spot.run}, {spot.begin_s:.0f} to {spot.end_s:.0f} s, {spot.vehicles} followers"))
         facts.append(("How much", f"{number(spot.accel_mps2, 2)} m/s² beside {law}"))
     if (before := r.error.before) is not None:
-        facts.append((f"Gap in free simulation, {law}", f"{number(before['gap_rmse_m'])} m on the test set; "
-                      f"sensor noise alone leaves {number(r.error.floor['gap_rmse_m'])} m"))  # fmt: skip
+        gap, noise = number(before["gap_rmse_m"]), number(r.error.floor["gap_rmse_m"])
+        size = f"{gap} m on the test set; sensor noise alone leaves {noise} m"
+        facts.append((f"Gap in free simulation, {law}", size))
     return [(name, "", text) for name, text in facts]

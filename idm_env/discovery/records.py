@@ -147,14 +147,10 @@ def _signals(samples: Samples, period: float) -> np.ndarray:
         place = np.concatenate([np.unwrap(p, period=period) for p in np.split(place, samples.bounds[1:-1])])
     rear = samples.position - np.repeat(samples.length, samples.lengths, axis=0)
     position, speed, accel, present = samples.position, samples.speed, samples.accel, samples.present
-    columns = [
-        rear[:, leader], speed[:, leader], accel[:, leader],
-        rear[:, second], speed[:, second], accel[:, second], present[:, second],
-        position[:, behind], speed[:, behind], accel[:, behind], present[:, behind],
-        *samples.beside.T,
-        position[:, driver], speed[:, driver], accel[:, driver], samples.time, place,
-        np.ones(len(place)),
-    ]  # fmt: skip
+    columns = [x[:, leader] for x in (rear, speed, accel)]
+    columns += [x[:, second] for x in (rear, speed, accel, present)]
+    columns += [*(x[:, behind] for x in (position, speed, accel, present)), *samples.beside.T]
+    columns += [*(x[:, driver] for x in (position, speed, accel)), samples.time, place, np.ones(len(place))]
     assert len(columns) == len(march.COLUMNS)
     return np.stack(columns, axis=1)
 
@@ -300,10 +296,8 @@ def whole(records: Records, longest_s: float = 300.0, every_s: float = 0.5) -> R
     count = int(max(np.array(lasts) - first) - 1) // every
     samples = first[:, None] + every * (1 + np.arange(count))
     valid = samples < np.array(lasts)[:, None]
-    return Rows(
-        records, np.array(record), first, count * every, every, valid, np.zeros(len(first), bool),
-        np.zeros(len(first), int),
-    )  # fmt: skip
+    none = (np.zeros(len(first), kind) for kind in (bool, int))
+    return Rows(records, np.array(record), first, count * every, every, valid, *none)
 
 
 def block_seconds(span: float) -> float:

@@ -54,17 +54,14 @@ def explain(
     with storage.results(out, EXPLAINED, [path]):
         if trajectories is None:
             progress("reading", 0, 0, path.name)
-            trajectories = recordings(
-                path, ring_length=question.ring_length, place=question.place, layout=question.layout,
-                columns=question.columns, where=question.where, seconds=question.split_s,
-            )  # fmt: skip
+            names = ("ring_length", "place", "layout", "columns", "where")
+            how: dict[str, Any] = {name: getattr(question, name) for name in names}
+            trajectories = recordings(path, seconds=question.split_s, **how)
         advice = cure(trajectories)
         if advice is not None:
             return undecided.write(trajectories, advice, out), ()
-        discovery = discover(
-            trajectories, by=question.by, effects=question.effects, known=question.known, out=out, resume=resume,
-            seed=question.seed, base=question.base, on_progress=progress,
-        )  # fmt: skip
+        request: dict[str, Any] = {name: getattr(question, name) for name in ("by", "effects", "known", "seed", "base")}
+        discovery = discover(trajectories, out=out, resume=resume, on_progress=progress, **request)
         progress("writing the report", 0, 0, "")
         write_report(discovery, out)
     result: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
@@ -106,10 +103,10 @@ def explain_sets(
         stamps = [(p, p.stat().st_size, p.stat().st_mtime_ns) if p.exists() else p for p in paths]
         parts = Parts(out / storage.UNFINISHED / "sets", storage.fingerprint(question, stamps), resume)
         command = page.ASKED.get()
-        sets = [
-            _Set(n, path.absolute(), out / name, question, parts, resume, command._replace(files=(str(path),)))
-            for n, (path, name) in enumerate(zip(paths, names, strict=True)) if not parts.done(n)
-        ]  # fmt: skip
+        sets = []
+        for n, (path, name) in enumerate(zip(paths, names, strict=True)):
+            line = command._replace(files=(str(path),))
+            sets += [_Set(n, path.absolute(), out / name, question, parts, resume, line)] * (not parts.done(n))
         done = len(paths) - len(sets)
         for _ in (executor or Serial()).map(_explain_set, sets, progress):
             done += 1
@@ -132,8 +129,7 @@ def _explain_set(one: _Set, on_progress: OnProgress) -> None:
         one.parts.finish(one.number, row | {"verdict": "not done", "effects": "", "sentence": str(error)})
         return
     before, after = report["error"]["before"], (report["partial"] or report["error"])["after"]
-    one.parts.finish(one.number, row | {
-        "verdict": report["verdict"], "sentence": report["sentence"],
-        "effects": " ".join(finding["effect"] or finding["label"] for finding in report["found"]),
-        "gap_rmse_before_m": before and before["gap_rmse_m"], "gap_rmse_after_m": after and after["gap_rmse_m"],
-    })  # fmt: skip
+    row |= {"verdict": report["verdict"], "sentence": report["sentence"]}
+    row |= {"effects": " ".join(finding["effect"] or finding["label"] for finding in report["found"])}
+    ends = {"gap_rmse_before_m": before and before["gap_rmse_m"], "gap_rmse_after_m": after and after["gap_rmse_m"]}
+    one.parts.finish(one.number, row | ends)

@@ -90,11 +90,9 @@ class Problem:
         on = np.tile(model.on, (copies, 1))
         pulse = np.zeros((copies, 3)) if pulse is None else march.pulsed(catalogue, pulse, on, phi)
         loop, working = march.loop(catalogue, dt), model.at_work
-        loop.march(
-            records.signals, records.bounds, rows.record, rows.start, rows.steps, rows.group, records.length,
-            np.exp(theta), phi, on, model.tables, march.back_steps(working, dt),
-            *march.lead_steps(working, dt), rows.every, dt, loop.varying, pulse, gap, speed,
-        )  # fmt: skip
+        measured = records.signals, records.bounds, rows.record, rows.start, rows.steps, rows.group, records.length
+        law = np.exp(theta), phi, on, model.tables, march.back_steps(working, dt), *march.lead_steps(working, dt)
+        loop.march(*measured, *law, rows.every, dt, loop.varying, pulse, gap, speed)
         return gap, speed
 
     def errors(
@@ -213,10 +211,9 @@ def prior_of(model: Hypothesis) -> np.ndarray:
     """Return the inverse variance of the prior of φ [Q]: 0 but for knots of curves."""
     if not model.entries.size:
         return np.zeros(0)
-    return np.concatenate([
-        np.where(np.isin(np.arange(t.size), t.pinned), PINNED, t.smoothness**-2.0 if t.smoothness else 0.0)
-        for t in model.terms
-    ])  # fmt: skip
+    pinned = [np.isin(np.arange(t.size), t.pinned) for t in model.terms]
+    soft = [t.smoothness**-2.0 if t.smoothness else 0.0 for t in model.terms]
+    return np.concatenate([np.where(fast, PINNED, x) for fast, x in zip(pinned, soft, strict=True)])
 
 
 def equations(problem: Problem, theta: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray]:

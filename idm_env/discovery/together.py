@@ -99,10 +99,8 @@ def _forward(searching: Search, fit: ClosedLoopFit, seed: int) -> tuple[Step, So
         scored[i] = Scored(scored[i].term, fitted, closed_loop.gains(fit, fitted))
         tested = test()
         if tested.p_value[i] < ALPHA and tested.gain[i] >= LEAST_GAIN:
-            same = [
-                int(j) for j in range(len(scored))
-                if j != i and first.p_value[j] < ALPHA and first.gain[j] >= (1.0 - SAME) * first.gain[i]
-            ]  # fmt: skip
+            alike = (first.p_value < ALPHA) & (first.gain >= (1.0 - SAME) * first.gain[i])
+            same = [j for j in np.flatnonzero(alike).tolist() if j != i]
             return Step(scored, tested, int(i), same), fitted
     return Step(scored, tested, None, []), None
 

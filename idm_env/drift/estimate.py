@@ -129,11 +129,7 @@ class Estimate:
     def numbers(self) -> dict[str, torch.Tensor]:
         """Return the numbers as a store takes them; ``of_numbers`` makes the estimate of them again."""
         s, path = self.settings, self.path
-        arrays = {
-            "sigma": s.sigma, "memory_time": s.memory_time, "noise": s.noise, "jitter": s.jitter, "spread": s.spread,
-            "log_error": self.log_error, "log_likelihood": self.log_likelihood,
-            **{f.name: getattr(path, f.name) for f in fields(path)},
-        }  # fmt: skip
+        arrays = {**vars(s), "log_error": self.log_error, "log_likelihood": self.log_likelihood, **vars(path)}
         return {name: torch.as_tensor(np.asarray(value, float)) for name, value in arrays.items()}
 
     @classmethod
@@ -219,11 +215,9 @@ def estimate(
     """
     drivers = MeasuredDrivers(simulator, batch, measured or batch, tuple(free))
     parameters = catalogue(simulator.effects)
-    settings = DriftSettings(
-        np.array([parameters[f"{n}.sigma"].default for n in drivers.drifts]),
-        np.array([parameters[f"{n}.memory_time"].default for n in drivers.drifts]),
-        np.array(noise or (0.1, 0.1)), 0.02, np.broadcast_to(np.asarray(spread, float), len(free)).copy(),
-    )  # fmt: skip
+    sigma, tau = (np.array([parameters[f"{n}.{p}"].default for n in drivers.drifts]) for p in ("sigma", "memory_time"))
+    wide = np.broadcast_to(np.asarray(spread, float), len(free)).copy()
+    settings = DriftSettings(sigma, tau, np.array(noise or (0.1, 0.1)), 0.02, wide)
     limits = _limits(drivers, noise)
     path = Path.without_drift(drivers, np.broadcast_to(np.clip(theta, *drivers.bounds), (len(batch), len(free))).copy())
     for _ in range(SETTLED):

@@ -65,14 +65,13 @@ def scores(
             draws = gap[steps - 1]
             able = np.isfinite(truth) & np.isfinite(draws).all(0)
             truth, draws = truth[able], draws[:, able]
-            rows.append({
-                "model": name, "ahead_s": ahead, "forecasts": int(able.sum()),
-                "gap_rmse_m": float(np.sqrt(np.mean((draws.mean(0) - truth) ** 2))),
-                "gap_crps_m": float(forecast.crps(draws, truth).mean()),
-                "in_50_percent": 100.0 * float(forecast.covers(draws, truth, 0.5)[0].mean()),
-                "in_90_percent": 100.0 * float(forecast.covers(draws, truth, 0.9)[0].mean()),
-                "widening": forecast.widening(draws, truth, 0.9),
-            })  # fmt: skip
+            row = {"model": name, "ahead_s": ahead, "forecasts": int(able.sum())}
+            row["gap_rmse_m"] = float(np.sqrt(np.mean((draws.mean(0) - truth) ** 2)))
+            row["gap_crps_m"] = float(forecast.crps(draws, truth).mean())
+            for percent in (50, 90):
+                inside = forecast.covers(draws, truth, percent / 100)[0]
+                row[f"in_{percent}_percent"] = 100.0 * float(inside.mean())
+            rows.append(row | {"widening": forecast.widening(draws, truth, 0.9)})
     return rows
 
 

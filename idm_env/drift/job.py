@@ -69,6 +69,9 @@ def drift_file(
         best = sorts.get(foremost, best)
         marked = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in fitted[0]])
         save_model(out / "model.yaml", replace(model_of(best), fitted_on=marked))
+        data: dict[str, Any] = {"episodes": len(both[0]), "taken": len(taken), "dt": best.drivers.batch.dt}
+        data["account"] = page.account(trajectories.repairs, both[0].left_out)
+        named = {"none": answer.steady, **answer.found}
         result = {
             "schema": 1,
             "command": page.command_line(),
@@ -77,15 +80,10 @@ def drift_file(
             "sentence": f"{foreseen} {sentence(answer)}".lstrip(),
             "sorts": _sorts(answer),
             "kept_back": {"drivers": len(rest), "scores": scores},
-            "estimates": {
-                name: [] if e.why_not else e.table() for name, e in {"none": answer.steady, **answer.found}.items()
-            },
-            "data": {
-                **trajectories.summary(), "episodes": len(both[0]), "taken": len(taken), "dt": best.drivers.batch.dt,
-                "account": page.account(trajectories.repairs, both[0].left_out),
-            },
+            "estimates": {name: [] if e.why_not else e.table() for name, e in named.items()},
+            "data": {**trajectories.summary(), **data},
             "versions": page.versions(),
-        }  # fmt: skip
+        }
         storage.write_json(out / "report.json", result)
         title, template = f"How the drivers of {trajectories.source} drift", Path(__file__).with_name("drift.html")
         page.write_page(out / "report.html", title, template=template, r=result, tables=tables)
@@ -106,11 +104,10 @@ def model_of(estimate: Estimate) -> Model:
     records: dict[str, list[np.ndarray]] = {}
     for e, theta in zip(drivers.batch.episodes, estimate.theta, strict=True):
         records.setdefault(f"{e.run_id}/{e.vehicle_id}", []).append(theta)
-    effects = tuple(e for e in drivers.simulator.effects if not isinstance(e, Replay))
-    return Model(
-        effects, {**numbers(np.median(estimate.theta, 0)), **drifts}, drivers.simulator.dt,
-        drivers.simulator.integration, {key: numbers(np.mean(x, 0)) for key, x in records.items()},
-    )  # fmt: skip
+    simulator, median = drivers.simulator, {**numbers(np.median(estimate.theta, 0)), **drifts}
+    effects = tuple(e for e in simulator.effects if not isinstance(e, Replay))
+    own = {key: numbers(np.mean(x, 0)) for key, x in records.items()}
+    return Model(effects, median, simulator.dt, simulator.integration, own)
 
 
 def sentence(answer: Told) -> str:
@@ -139,11 +136,9 @@ def _sorts(answer: Told) -> list[dict[str, Any]]:
     for name in sorted(answer.found, key=lambda n: (bool(answer.found[n].why_not), -answer.gain[n])):
         why = answer.found[name].why_not or answer.steady.why_not
         numbers = {} if why else {str(row["name"]): row["estimate"] for row in answer.found[name].table()}
-        rows.append({
-            "sort": name, "log_likelihood": None if why else answer.gain[name],
-            "sigma": numbers.get(f"{name}.sigma"), "tau_s": numbers.get(f"{name}.memory_time"),
-            "note": f"not estimated: {why}" if why else "",
-        })  # fmt: skip
+        row = {"sort": name, "log_likelihood": None if why else answer.gain[name]}
+        row |= {"sigma": numbers.get(f"{name}.sigma"), "tau_s": numbers.get(f"{name}.memory_time")}
+        rows.append(row | {"note": f"not estimated: {why}" if why else ""})
     return rows
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -132,18 +133,13 @@ class MeasuredDrivers:
         speeds, accels = (x[:-1, :, self.at] for x in (batch.all_speed, batch.accel))
         speeds = torch.cat((speeds[..., :d], speed.unsqueeze(-1), speeds[..., d + 1 :]), -1)
         present = batch.present[..., self.at] if self.at != slice(1, 3) else None
-        state = simulator.state(
-            position, speeds, params, length=batch.length[:, self.at], accel=accels,
-            present=None if present is None else present[:-1],
-            step=batch.first_step + torch.arange(len(gap))[:, None],
-        )  # fmt: skip
+        more: Any = {"length": batch.length[:, self.at], "present": None if present is None else present[:-1]}
+        steps = batch.first_step + torch.arange(len(gap))[:, None]
+        state = simulator.state(position, speeds, params, accel=accels, step=steps, **more)
         levels = {name: level[own + j].unsqueeze(-1).expand(position.shape) for j, name in enumerate(self.drifts)}
         speeds_later, accels_later = (x[1:, :, self.at] for x in (batch.all_speed, batch.accel))
-        record = Record(
-            later, speeds_later, accels_later,
-            (torch.arange(position.shape[-1]) != d).expand(position.shape),
-            None if present is None else present[1:],
-        )  # fmt: skip
+        active = (torch.arange(position.shape[-1]) != d).expand(position.shape)
+        record = Record(later, speeds_later, accels_later, active, None if present is None else present[1:])
         still = torch.zeros_like(position)
         inputs = {"replay": record, **dict.fromkeys(simulator.draws, still)}
         after = simulator.step(state._replace(memory={**state.memory, **levels}), inputs, params)

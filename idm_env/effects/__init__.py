@@ -126,7 +126,5 @@ def _fits(value: object, hint: Any) -> bool:
     return isinstance(value, hint)
 
 
-__all__ = [
-    "ALL", "BASES", "CANDIDATES", "DRIFTS", "CarFollowing", "Effect", "base_named", "candidates", "describe",
-    "make", "module_at", "named", "register", "unspoken", *(effect.__name__ for effect in ALL.values()),
-]  # fmt: skip
+__all__ = ["ALL", "BASES", "CANDIDATES", "DRIFTS", "CarFollowing", "Effect", "base_named", "candidates", "describe"]
+__all__ += ["make", "module_at", "named", "register", "unspoken", *(effect.__name__ for effect in ALL.values())]

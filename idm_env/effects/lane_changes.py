@@ -183,7 +183,7 @@ class GapAcceptance(Effect):
         return level + (stands - level) * -torch.expm1(-scene.dt / p["patience"])
 
     def change(self, scene: Scene, driver: Driver, p: P) -> Wish:
-        """Return no wish, and the margins of a driver who accepts more, where he does."""
+        """Return no utility, and safety margins that relax with the urgency of a change (m/s²)."""
         here, left, right = _lanes(scene)
         none = torch.zeros_like(scene.speed)
 

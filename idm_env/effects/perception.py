@@ -100,7 +100,7 @@ class ClosingGain(Effect):
     declared = (Parameter("gain", "k", "1", 0.5, 0.05, 20.0, null=1.0, starts=(0.7, 1.4)),)
 
     def perceive(self, scene: Scene, p: P) -> Scene:
-        """Return the scene in which the leader is as much faster or slower as the driver takes him to be."""
+        """Return the scene with the leader's speed shifted so that the closing speed counts k times."""
         leader = scene.leader
         closing = (scene.speed - leader.speed) * leader.present
         return scene._replace(leader=leader._replace(speed=leader.speed + (1.0 - p["gain"]) * closing))

@@ -41,9 +41,9 @@ def enter(effect: type[Effect], catalogue: dict[str, type[Effect]]) -> type[Effe
 
 def is_candidate(effect: type[Effect]) -> bool:
     """Tell whether a search can switch an effect on and off: it has a null, and accelerations that it changes."""
-    return not issubclass(effect, CarFollowing) and effect.hook not in ("place", "change") and any(
-        p.null is not None for p in effect().parameters
-    )  # fmt: skip
+    if issubclass(effect, CarFollowing) or effect.hook in ("place", "change"):
+        return False
+    return any(p.null is not None for p in effect().parameters)
 
 
 def read(where: str) -> type[Effect]:

@@ -202,7 +202,7 @@ class Destination(Effect):
     )
 
     def room(self, scene: Scene, p: P) -> Tensor:
-        """Return how far the lane goes on for whom it does not lead where he wants to."""
+        """Return the distance to the last place to change (m) for drivers on a wrong lane, otherwise FAR."""
         assert scene.lane is not None
         away = torch.relu(p["first"] - scene.lane) + torch.relu(scene.lane - p["last"])
         way = torch.clamp(p["place"] - _PER_LANE * (away - 1.0) - scene.position, min=1.0)

@@ -13,10 +13,8 @@ from torch import Tensor
 from idm_env import compat
 from idm_env.types import Driver, Motion, Scene, Wish
 
-RETURNS: Mapping[str, type] = {
-    "perceive": Scene, "adapt": Driver, "driver": Driver, "accelerate": Tensor, "limit": Tensor, "place": Motion,
-    "change": Wish, "remember": Tensor, "initial_memory": Tensor, "room": Tensor,
-}  # fmt: skip
+RETURNS: dict[str, type] = {"perceive": Scene, "adapt": Driver, "driver": Driver, "place": Motion, "change": Wish}
+RETURNS |= dict.fromkeys(("accelerate", "limit", "remember", "initial_memory", "room"), Tensor)
 """What the methods of an effect return that a step calls; a plain number stands for a tensor, too."""
 MAY_BE_NONE = ("initial_memory", "room")
 

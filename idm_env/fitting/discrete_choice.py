@@ -210,13 +210,9 @@ def fit_choice(
         (gradient,) = torch.autograd.grad(total, theta)
         return float(total.detach()), gradient.numpy()
 
-    ends = [
-        optimize.minimize(
-            cost, np.clip(start, low, high), jac=True, method="L-BFGS-B",
-            bounds=list(zip(low, high, strict=True)), options={"maxiter": 500, "ftol": 1e-12, "gtol": 1e-7},
-        )
-        for start in starts or model.starts()
-    ]  # fmt: skip
+    how: dict[str, Any] = {"jac": True, "method": "L-BFGS-B", "bounds": list(zip(low, high, strict=True))}
+    how["options"] = {"maxiter": 500, "ftol": 1e-12, "gtol": 1e-7}
+    ends = [optimize.minimize(cost, np.clip(start, low, high), **how) for start in starts or model.starts()]
     theta = torch.tensor(min(ends, key=lambda end: float(end.fun)).x, dtype=torch.float64)
     span = torch.tensor(high - low)
     at_bound = torch.minimum(theta - torch.tensor(low), torch.tensor(high) - theta) < 1e-6 * span
@@ -254,7 +250,7 @@ def _standard_errors(model: Choice, theta: Tensor, decisions: Decisions, at_boun
 
 
 def folds(decisions: Decisions, count: int, seed: int) -> Tensor:
-    """Return the fold of every vehicle, those who change and those who do not spread evenly over all of them."""
+    """Return the fold of every vehicle, stratified by whether it changes lanes."""
     changes = torch.zeros(len(decisions.vehicles)).index_add(0, decisions.vehicle, (decisions.chosen > 0).float())
     shuffle = torch.randperm(len(changes), generator=torch.Generator().manual_seed(seed))
     order = shuffle[torch.argsort(-(changes[shuffle] > 0).int(), stable=True)]
@@ -271,7 +267,7 @@ class HeldOut(NamedTuple):
 
 
 def held_out(fitted: Sequence[Chosen], decisions: Decisions, fold: Tensor) -> list[HeldOut]:
-    """Return, for every model, what it says of every driver when it is fitted to the drivers of the other folds.
+    """Return log-likelihoods and probabilities of every model on the drivers held out of its fit, fold by fold.
 
     These fits begin where that to all drivers ended.
     """

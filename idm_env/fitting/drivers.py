@@ -63,10 +63,8 @@ class Estimates:
         def column(name: str) -> Tensor:
             return torch.from_numpy(table[name].to_numpy().copy()).reshape(-1, count)
 
-        return cls(
-            simulator, dt, fixed, names, tuple(table["group"].gather_every(count)), column("estimate"),
-            column("standard_error"), column("at_bound"), column("identified"),
-        )  # fmt: skip
+        groups, columns = tuple(table["group"].gather_every(count)), ("standard_error", "at_bound", "identified")
+        return cls(simulator, dt, fixed, names, groups, column("estimate"), *map(column, columns))
 
 
 def table(result: Fit, error: Errors, by: str) -> list[dict[str, Any]]:
@@ -103,12 +101,10 @@ def bounds(estimates: Estimates) -> list[dict[str, Any]]:
         on = estimates.at_bound[:, i]
         lower = on & (values[:, i] < 0.5 * (p.low + p.high))
         low, middle, high = np.quantile(values[:, i].numpy(), [0.1, 0.5, 0.9]).tolist()
-        rows.append({
-            "parameter": name, "words": p.words, "symbol": p.symbol, "unit": p.unit,
-            "median": middle, "p10": low, "p90": high, "low": p.low, "high": p.high,
-            "groups": len(values), "on_low": int(lower.sum()), "on_high": int((on & ~lower).sum()),
-            "not_identified": int((~estimates.identified[:, i] & ~on).sum()),
-        })  # fmt: skip
+        row: dict[str, Any] = {"parameter": name, "words": p.words, "symbol": p.symbol, "unit": p.unit}
+        row |= {"median": middle, "p10": low, "p90": high, "low": p.low, "high": p.high, "groups": len(values)}
+        row |= {"on_low": int(lower.sum()), "on_high": int((on & ~lower).sum())}
+        rows.append(row | {"not_identified": int((~estimates.identified[:, i] & ~on).sum())})
     return rows
 
 

@@ -132,10 +132,9 @@ def fit(
     batch = Batch.stack(episodes, substeps=substeps)
     group, names = group_of(batch.episodes, by)
     simulator = dataclasses.replace(simulator or base_simulator(), dt=batch.step)
-    problem = Problem(
-        simulator, batch, own_names(simulator) if free is None else tuple(free), tuple(shared), group, names,
-        objective=objective, relative=relative, loss=loss, skip=skip, fixed=dict(fixed or {}), prior=prior,
-    )  # fmt: skip
+    chosen = own_names(simulator) if free is None else tuple(free)
+    cost: dict[str, Any] = {"objective": objective, "relative": relative, "loss": loss, "skip": skip, "prior": prior}
+    problem = Problem(simulator, batch, chosen, tuple(shared), group, names, fixed=dict(fixed or {}), **cost)
     saved = storage.Store(checkpoint, fingerprint(problem, method, starts, iterations, seed), resume)
     begin = start or (_defaults(problem, problem.own).expand(len(names), -1), _defaults(problem, problem.shared))
     if method == "adam":

@@ -214,10 +214,9 @@ def _held_out(
     items = source.episodes(held)
     batch = Batch.stack(items, substeps=options.substeps)
     group, names = group_of(batch.episodes, options.by)
-    problem = Problem(
-        dataclasses.replace(estimates.simulator, dt=batch.step), batch, estimates.names, (), group, names,
-        objective=options.objective, relative=options.relative, loss=options.loss, fixed=estimates.fixed,
-    )  # fmt: skip
+    simulator = dataclasses.replace(estimates.simulator, dt=batch.step)
+    cost: dict[str, Any] = {name: getattr(options, name) for name in ("objective", "relative", "loss")}
+    problem = Problem(simulator, batch, estimates.names, (), group, names, fixed=estimates.fixed, **cost)
     own, unseen = estimates.own_for(names, pooled.values[0])
     error, _ = errors(problem, own, own[0, :0])
     return {
@@ -275,10 +274,9 @@ def _overlap(model: Model, overlap: dict[Track, str] | None, items: Episodes, er
         )
     else:
         words = "on data that the model was not fitted on."
-    return {
-        "source": model.fitted_on.get("source"), "episodes_fitted_on": None if overlap is None else count,
-        "gap_rmse_of_others_m": None if overlap is None else others, "words": words,
-    }  # fmt: skip
+    numbers = (None, None) if overlap is None else (count, others)
+    names = ("source", "episodes_fitted_on", "gap_rmse_of_others_m", "words")
+    return dict(zip(names, (model.fitted_on.get("source"), *numbers, words), strict=True))
 
 
 def drivers_in_words(model: Model, matched: int, count: int) -> str:
@@ -347,11 +345,9 @@ def _simulate_file(
 
 def in_words(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return errors under their names in words and units."""
-    names = {
-        "": "", "gap_rmse_m": "gap RMSE (m)", "gap_rmse_median_m": "median gap RMSE (m)",
-        "gap_mae_m": "mean |gap error| (m)", "speed_rmse_mps": "speed RMSE (m/s)", "collisions": "collisions",
-        "episodes": "episodes",
-    }  # fmt: skip
+    names = {"": "", "gap_rmse_m": "gap RMSE (m)", "gap_rmse_median_m": "median gap RMSE (m)"}
+    names |= {"gap_mae_m": "mean |gap error| (m)", "speed_rmse_mps": "speed RMSE (m/s)"}
+    names |= {name: name for name in ("collisions", "episodes")}
     return [{title: row[name] for name, title in names.items() if name in row} for row in rows]
 
 

@@ -63,16 +63,14 @@ class LaneChanges(NamedTuple):
         rows = []
         for chosen, seen in zip(self.fitted, self.held_out, strict=True):
             ahead = discrete_choice.per_vehicle(self.decisions, self.held_out[0].log_likelihood - seen.log_likelihood)
-            rows.append({
-                "model": chosen.model.title, "parameters": len(chosen.theta), "fitted": chosen.log_likelihood,
-                "held_out": float(seen.log_likelihood.sum()), "mobil_gains": float(ahead.sum()),
-                "standard_error": float(ahead.std() * len(ahead) ** 0.5),
-                "expected_changes": float(seen.probabilities[:, 1:].sum()),
-            })  # fmt: skip
+            row: dict[str, Any] = {"model": chosen.model.title, "parameters": len(chosen.theta)}
+            row |= {"fitted": chosen.log_likelihood, "held_out": float(seen.log_likelihood.sum())}
+            row |= {"mobil_gains": float(ahead.sum()), "standard_error": float(ahead.std() * len(ahead) ** 0.5)}
+            rows.append(row | {"expected_changes": float(seen.probabilities[:, 1:].sum())})
         return rows
 
     def calibration(self, which: int = 0) -> list[dict[str, Any]]:
-        """Return how often unseen drivers changed where a model said so: bins of about the same expected changes."""
+        """Return expected and observed changes of held-out drivers, in bins of about equal expected changes."""
         risk = self.held_out[which].probabilities[:, 1:].sum(-1)
         changed = (self.decisions.chosen > 0).double()
         bins = min(5, max(2, self.decisions.changes // 5))
@@ -83,10 +81,9 @@ class LaneChanges(NamedTuple):
         for k in range(bins):
             mine = order[bin_of == k]
             if len(mine):
-                rows.append({
-                    "decisions": len(mine), "lowest": float(risk[mine].min()), "highest": float(risk[mine].max()),
-                    "expected": float(risk[mine].sum()), "observed": int(changed[mine].sum()),
-                })  # fmt: skip
+                ends = {"lowest": float(risk[mine].min()), "highest": float(risk[mine].max())}
+                sums = {"expected": float(risk[mine].sum()), "observed": int(changed[mine].sum())}
+                rows.append({"decisions": len(mine), **ends, **sums})
         return rows
 
 
@@ -101,10 +98,8 @@ def lane_changes(
     options, progress = options or ChangeOptions(), on_progress or silent
     model = _model(options)
     progress("decisions", 0, 0, trajectories.source)
-    decisions = recorded_decisions(
-        trajectories, model.simulator, _params_of(model), every=options.every, ahead=options.ahead,
-        first_lane=options.first_lane,
-    )  # fmt: skip
+    when: dict[str, Any] = {name: getattr(options, name) for name in ("every", "ahead", "first_lane")}
+    decisions = recorded_decisions(trajectories, model.simulator, _params_of(model), **when)
     free = options.free or tuple(f"{Mobil.kind}.{p.name}" for p in Mobil.declared)
     mobil = discrete_choice.UtilityLogit(model.simulator(Lanes(2)), free)
     models: list[discrete_choice.Choice] = [mobil, discrete_choice.CONSTANT_RATE, discrete_choice.GAP_ACCEPTANCE]
@@ -168,21 +163,20 @@ def _result(fit: LaneChanges, trajectories: Trajectories, options: ChangeOptions
     decisions, compared = fit.decisions, fit.compared()
     account = page.account(trajectories.repairs, decisions.left_out)
     left = int((decisions.chosen == 1).sum())
+    counts = {"count": len(decisions), "changes": decisions.changes, "left": left, "right": decisions.changes - left}
+    vehicles = int(decisions.vehicle.unique().numel())
     return {
         "schema": 1,
         "command": page.command_line(),
         "data": {**trajectories.summary(), "left_out": [str(r) for r in decisions.left_out], "account": account},
         "options": vars(options),
-        "decisions": {
-            "count": len(decisions), "changes": decisions.changes, "left": left, "right": decisions.changes - left,
-            "vehicles": int(decisions.vehicle.unique().numel()),
-        },
+        "decisions": {**counts, "vehicles": vehicles},
         "parameters": fit.mobil.table(),
         "models": compared,
         "calibration": fit.calibration(),
         "sentence": _sentence(fit, compared),
         "versions": page.versions(),
-    }  # fmt: skip
+    }
 
 
 def _sentence(fit: LaneChanges, compared: list[dict[str, Any]]) -> str:

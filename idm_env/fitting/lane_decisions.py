@@ -110,9 +110,10 @@ def recorded_decisions(
         clocked, ids = _on_clock(rows, trajectories.steps[run], every, ahead, first_lane)
         mine = np.array([drivers_taken is None or f"{run}/{v}" in drivers_taken for v in ids])
         drivers = [params_of(f"{run}/{v}") for v in ids]
-        for begin in range(0, len(clocked.position), max(1, ROWS // len(ids))):
-            times = slice(begin, begin + max(1, ROWS // len(ids)))
-            parts += _decided(clocked, times, mine, simulator, drivers, len(names), lost)
+        if clocked.count > 1:
+            sim, each = simulator(_road(clocked)), max(1, ROWS // len(ids))
+            for begin in range(0, len(clocked.position), each):
+                parts += _decided(clocked, slice(begin, begin + each), mine, sim, drivers, len(names), lost)
         names += [f"{run}/{v}" for v in ids]
     if not any(len(part[-1]) for part in parts):
         raise DataError(f"{trajectories.source}: no driver has a lane beside his own. Lane changes need several lanes.")
@@ -154,11 +155,9 @@ def _on_clock(rows: pl.DataFrame, dt: float, every: float, ahead: float, first_l
     last = shape[0] - 1 - stride - early
     begin = np.arange(0, max(last + 1, 0), stride)
     rings = rows["ring_length_m"].drop_nulls() if "ring_length_m" in rows.columns else rows["lane"].head(0)
-    return _Run(
-        position[begin], np.clip(speed[begin], 0.0, None), np.nan_to_num(accel[begin]), length[begin],
-        lane[begin], lane[begin + early], lane[begin + early + stride], len(numbers),
-        float(rings[0]) if len(rings) else None,
-    ), ids  # fmt: skip
+    motion = position[begin], np.clip(speed[begin], 0.0, None), np.nan_to_num(accel[begin]), length[begin]
+    lanes = lane[begin], lane[begin + early], lane[begin + early + stride]
+    return _Run(*motion, *lanes, len(numbers), float(rings[0]) if len(rings) else None), ids
 
 
 def _road(run: _Run) -> Lanes:
@@ -176,12 +175,11 @@ def _road(run: _Run) -> Lanes:
 
 
 def _decided(
-    run: _Run, times: slice, mine: np.ndarray, simulator: Callable[[Lanes], Simulator], params: list[Params],
-    first: int, lost: dict[str, int],
-) -> list[tuple[Scene, Params, Tensor, Tensor, Tensor]]:  # fmt: skip
+    run: _Run, times: slice, mine: np.ndarray, sim: Simulator, params: list[Params], first: int, lost: dict[str, int]
+) -> list[tuple[Scene, Params, Tensor, Tensor, Tensor]]:
     """Return scene, parameters, possible sides, choices and vehicles of some times of a run."""
     valid = np.isfinite(run.position[times]) & np.isfinite(run.speed[times]) & (run.lane[times] >= 0)
-    if run.count == 1 or not valid.any():
+    if not valid.any():
         return []
     # Slots are those who are there at one time: of a long record these are few.
     slot = np.argsort(~valid, axis=1, kind="stable")[:, : int(valid.sum(1).max())]
@@ -191,12 +189,9 @@ def _decided(
 
     present = torch.as_tensor(np.take_along_axis(valid, slot, 1))
     lane, before, after = (cut(x).long() for x in (run.lane, run.before, run.after))
-    sim = simulator(_road(run))
     own = _of_slots(params, torch.as_tensor(slot))
-    state = sim.state(
-        cut(run.position), cut(run.speed), own, length=cut(run.length, 1.0), accel=cut(run.accel),
-        present=present.double(), lane=lane, step=torch.arange(len(slot)),
-    )  # fmt: skip
+    more: Any = {"length": cut(run.length, 1.0), "accel": cut(run.accel), "present": present.double()}
+    state = sim.state(cut(run.position), cut(run.speed), own, lane=lane, step=torch.arange(len(slot)), **more)
     view = sim.road.view(state)
     assert isinstance(view, Linked)
     with torch.no_grad():

@@ -87,12 +87,8 @@ class Options:
             raise ValueError(f"base = '{self.base}', and the model {self.model} has one. Leave one of them out.")
         saved = load_model(Path(self.model))
         simulator = Simulator(Lane(), behind_records(saved), dt=saved.dt, integration=saved.integration)
-        fixed = {
-            f"{effect}.{name}": float(value)
-            for effect, parameters in saved.parameters.items() if effect != simulator.base.name
-            for name, value in parameters.items()
-        }  # fmt: skip
-        return simulator, fixed
+        others = {effect: own for effect, own in saved.parameters.items() if effect != simulator.base.name}
+        return simulator, {f"{effect}.{name}": float(x) for effect, own in others.items() for name, x in own.items()}
 
 
 def behind_records(model: Model) -> tuple[Effect, ...]:

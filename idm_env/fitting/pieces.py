@@ -88,11 +88,10 @@ def _fit_piece(piece: Piece, on_progress: OnProgress) -> None:
     else:
         data = piece.data
     simulator, fixed = options.simulator()
-    result = fit(
-        data, by=piece.by, simulator=simulator, objective=options.objective, relative=options.relative,
-        loss=options.loss, method=options.method, starts=options.starts, seed=options.seed, substeps=options.substeps,
-        fixed=fixed, checkpoint=piece.checkpoint, resume=piece.resume, on_progress=on_progress,
-    )  # fmt: skip
+    names = ("objective", "relative", "loss", "method", "starts", "seed", "substeps")
+    how: dict[str, Any] = {name: getattr(options, name) for name in names}
+    how |= {"checkpoint": piece.checkpoint, "resume": piece.resume, "on_progress": on_progress}
+    result = fit(data, by=piece.by, simulator=simulator, fixed=fixed, **how)
     on_progress("errors", 0, 0, "in free simulation")
     error, simulated = errors(result.problem, result.own, result.shared)
     parts.write(number, PARAMETERS, pl.DataFrame(result.table()))
@@ -102,10 +101,9 @@ def _fit_piece(piece: Piece, on_progress: OnProgress) -> None:
     if number == 0:
         figures = [pictures.examples(result.problem, error, simulated), pictures.residuals(result.problem, simulated)]
         figures += pictures.space_time(result.problem, simulated)
-    parts.finish(number, summary | {
-        "iterations": result.iterations, "converged": int(result.converged.sum()), "dt": result.problem.batch.dt,
-        "pictures": [{"text": b.text, "image": b.image, "narrow": b.narrow} for b in figures],
-    })  # fmt: skip
+    summary |= {"iterations": result.iterations, "converged": int(result.converged.sum())}
+    blocks = [{"text": b.text, "image": b.image, "narrow": b.narrow} for b in figures]
+    parts.finish(number, {**summary, "dt": result.problem.batch.dt, "pictures": blocks})
 
 
 def _summary(trajectories: Trajectories, left_out: Sequence[Repair]) -> dict[str, Any]:

@@ -75,7 +75,7 @@ class LeastSquares(Protocol):
 
     @property
     def costs(self) -> Callable[[Tensor, Tensor], Tensor] | None:
-        """The cost of ``normal``, where that is had for much less; trials of shared parameters are judged by it.
+        """Cost alone, as in ``normal``, if that is much cheaper; it judges trials of shared parameters.
 
         Without it they are judged after the own ones have followed for ``FOLLOWING`` steps.
         """

@@ -11,10 +11,8 @@ from idm_env.jobs.storage import refuse_unwritable, write_text
 from idm_env.model_file import Model
 
 _MARK = "<!-- Written by idm-env fit. -->"
-ATTRIBUTES = {
-    "accel": "max_accel", "decel": "comfort_decel", "tau": "time_gap", "minGap": "min_gap", "maxSpeed": "desired_speed",
-    "delta": "exponent",
-}  # fmt: skip
+ATTRIBUTES = {"accel": "max_accel", "decel": "comfort_decel", "tau": "time_gap", "minGap": "min_gap"}
+ATTRIBUTES |= {"maxSpeed": "desired_speed", "delta": "exponent"}
 """SUMO's attribute → IDM's parameter: m/s², m/s², s, m, m/s, none."""
 
 

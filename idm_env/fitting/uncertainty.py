@@ -30,11 +30,10 @@ def estimate_row(
 ) -> dict[str, Any]:
     """Return one parameter's row of a table: estimate [], standard error [], 95 % interval, and flags of doubt."""
     middle, half = float(estimate), 1.96 * float(error)
-    return {
-        "parameter": name, "symbol": p.symbol, "unit": p.unit, "estimate": middle, "standard_error": float(error),
-        "low": max(middle - half, p.low), "high": min(middle + half, p.high),
-        "at_bound": bool(at_bound), "identified": bool(identified),
-    }  # fmt: skip
+    row: dict[str, Any] = {"parameter": name, "symbol": p.symbol, "unit": p.unit}
+    row |= {"estimate": middle, "standard_error": float(error)}
+    row |= {"low": max(middle - half, p.low), "high": min(middle + half, p.high)}
+    return row | {"at_bound": bool(at_bound), "identified": bool(identified)}
 
 
 def effective_samples(residual: Tensor, weight: Tensor) -> Tensor:

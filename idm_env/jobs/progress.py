@@ -42,11 +42,10 @@ class _Bars:
     def __init__(self, console: Console) -> None:
         from rich import progress as rich
 
-        columns = (
-            rich.TextColumn("{task.description:<14}", markup=False), rich.BarColumn(bar_width=24),
-            rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"), rich.TimeRemainingColumn(),
-            rich.TextColumn("{task.fields[words]}", markup=False),
-        )  # fmt: skip
+        texts = ("{task.description:<14}", "{task.fields[words]}")
+        phase, words = (rich.TextColumn(text, markup=False) for text in texts)
+        times = rich.TimeElapsedColumn(), rich.TextColumn("left"), rich.TimeRemainingColumn()
+        columns = phase, rich.BarColumn(bar_width=24), rich.MofNCompleteColumn(), *times, words
         self._bars = rich.Progress(*columns, console=console, speed_estimate_period=600.0)
         self._tasks: dict[str, Any] = {}
         self._running = ""

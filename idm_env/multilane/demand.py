@@ -55,10 +55,8 @@ def trips(
     if slots is None:
         again = [math.inf] * len(again)
     none = torch.zeros(len(lane), dtype=torch.int64)
-    return Trips(
-        torch.tensor(departs, dtype=dtype), torch.tensor(again, dtype=dtype), torch.tensor(lane),
-        torch.full((len(lane),), speed, dtype=dtype), none, none.clone(),
-    )  # fmt: skip
+    begin, later = (torch.tensor(x, dtype=dtype) for x in (departs, again))
+    return Trips(begin, later, torch.tensor(lane), torch.full((len(lane),), speed, dtype=dtype), none, none.clone())
 
 
 def evenly(

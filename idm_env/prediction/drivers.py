@@ -171,11 +171,9 @@ def _episode(number: int, second: Second, h: DriverHypothesis) -> Episode:
     pace, everywhere = np.where(nearer, 0.0, second.ahead.speed), np.ones(count, bool)
     leader = Recorded(rear, pace, np.zeros(count), 0.0, everywhere)
     nobody = Recorded(position + 1e3, second.speeds, np.zeros(count), 0.0, ~everywhere)
-    name = str(number)
-    return Episode(
-        "", name, "", name, DT, DT * np.arange(count), position, second.speeds, rear - position, 2 * second.front,
-        leader, nobody, nobody, nobody, position, {}, {},
-    )  # fmt: skip
+    name, own = str(number), (DT * np.arange(count), position, second.speeds, rear - position)
+    around = leader, nobody, nobody, nobody
+    return Episode("", name, "", name, DT, *own, 2 * second.front, *around, position, {}, {})
 
 
 def _draw(

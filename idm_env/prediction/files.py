@@ -17,6 +17,7 @@ from idm_env.jobs.executor import Executor, Serial
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.jobs.shards import Parts
 from idm_env.prediction import report as written
+from idm_env.prediction.drivers import NAMES
 from idm_env.prediction.metrics import Case, Score, intervals, score, shape_of, summary
 from idm_env.prediction.pictures import scene_picture
 from idm_env.prediction.predict import METHODS, Prediction, available
@@ -26,17 +27,10 @@ from idm_env.reports import page
 OURS = "drivers on routes"
 OUTPUT = ("predictions.parquet", "parameters.parquet", "report.json", "report.html")
 MOST_PICTURES = 24
-SCHEMA = {
-    "scenario_id": pl.String, "agent_id": pl.Int64, "kind": pl.String, "source": pl.String, "future": pl.Int32,
-    "confidence": pl.Float64, "time_s": pl.Float64, "x_m": pl.Float64, "y_m": pl.Float64,
-}  # fmt: skip
-PARAMETERS = {
-    "scenario_id": pl.String, "agent_id": pl.Int64, "source": pl.String,
-    **{
-        f"{name}{end}": pl.Float64
-        for name in ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed") for end in ("", "_deviation")
-    },
-}  # fmt: skip
+SCHEMA: dict[str, Any] = {"scenario_id": pl.String, "agent_id": pl.Int64, "kind": pl.String, "source": pl.String}
+SCHEMA |= {"future": pl.Int32, **dict.fromkeys(("confidence", "time_s", "x_m", "y_m"), pl.Float64)}
+PARAMETERS: dict[str, Any] = {"scenario_id": pl.String, "agent_id": pl.Int64, "source": pl.String}
+PARAMETERS |= {f"{name}{end}": pl.Float64 for name in NAMES for end in ("", "_deviation")}
 
 
 def predict_files(
@@ -70,10 +64,9 @@ def _predict_files(
     progress("counting", 0, 0, "scenarios")
     counts = [count(path) for path in files]
     everything = sum(counts)
-    jobs = [
-        _Job(parts, number, path.absolute(), tuple(available()), sum(counts[:number]), everything)
-        for number, path in enumerate(files) if not parts.done(number)
-    ]  # fmt: skip
+    numbers = [number for number in range(len(files)) if not parts.done(number)]
+    methods, before_each = tuple(available()), [sum(counts[:number]) for number in range(len(files))]
+    jobs = [_Job(parts, n, files[n].absolute(), methods, before_each[n], everything) for n in numbers]
     before = everything - sum(counts[job.number] for job in jobs)
     if before:
         progress("predict", before, everything, "")
@@ -194,14 +187,11 @@ def _rows(scenario: Scenario, prediction: Prediction) -> pl.DataFrame:
     count, steps = prediction.futures.shape[:2]
     agent = scenario.agents[prediction.agent]
     time = 0.1 * np.arange(1, steps + 1)
-    columns: dict[str, Any] = {
-        "scenario_id": [scenario.id] * (count * steps), "agent_id": np.full(count * steps, agent.id),
-        "kind": [agent.kind] * (count * steps), "source": [prediction.source] * (count * steps),
-        "future": np.repeat(np.arange(count), steps), "confidence": np.repeat(prediction.confidence, steps),
-        "time_s": np.tile(time, count), "x_m": prediction.futures[..., 0].ravel(),
-        "y_m": prediction.futures[..., 1].ravel(),
-    }  # fmt: skip
-    return pl.DataFrame(columns, schema=SCHEMA)
+    names = {"scenario_id": scenario.id, "agent_id": agent.id, "kind": agent.kind, "source": prediction.source}
+    columns: dict[str, Any] = {name: [value] * (count * steps) for name, value in names.items()}
+    columns |= {"future": np.repeat(np.arange(count), steps), "confidence": np.repeat(prediction.confidence, steps)}
+    columns |= {"time_s": np.tile(time, count), "x_m": prediction.futures[..., 0].ravel()}
+    return pl.DataFrame(columns | {"y_m": prediction.futures[..., 1].ravel()}, schema=SCHEMA)
 
 
 def _parameters(scenario: Scenario, prediction: Prediction) -> dict[str, Any]:

@@ -114,11 +114,10 @@ def roll(courses: Sequence[Course], speed: float, steps: int, front: float) -> l
     desired = torch.as_tensor(drivers.desired_speed)
     # IDM brakes without measure above its desired speed: there it is kept to comfortable braking
     gentle = (1.0 + idm["comfort_decel"][:, 0] / idm["max_accel"][:, 0]) ** -0.25
-    state = sim.state(
-        torch.stack([torch.minimum(rear[0], line), own], dim=-1),
-        torch.stack([torch.where(line < rear[0], 0.0, pace[0]), torch.full_like(own, speed)], dim=-1),
-        params | {"idm": {**params["idm"], **idm}}, length=torch.tensor([0.0, 2 * front], dtype=torch.float64),
-    )  # fmt: skip
+    position = torch.stack([torch.minimum(rear[0], line), own], dim=-1)
+    speeds = torch.stack([torch.where(line < rear[0], 0.0, pace[0]), torch.full_like(own, speed)], dim=-1)
+    length = torch.tensor([0.0, 2 * front], dtype=torch.float64)
+    state = sim.state(position, speeds, params | {"idm": {**params["idm"], **idm}}, length=length)
     active = torch.tensor([True, False]).expand(len(rows), 2)
     motion = torch.empty(2, steps, len(rows), dtype=torch.float64)
     index, nothing = torch.arange(len(rows)), torch.zeros_like(own)

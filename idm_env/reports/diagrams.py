@@ -285,11 +285,9 @@ def _packed(panel: Panel, together: Sequence[Panel], stride: int, fastest: float
     place = _range(places)
     packed = []
     for line, along in zip(lines, places, strict=True):
-        packed.append({
-            "name": line.name, "marked": line.marked, "time": _bits(line.time, *time), "place": _bits(along, *place),
-            "speed": _bits(line.speed, 0.0, fastest),
-            "breaks": (np.flatnonzero(~line.whole(panel.ring_length)) + 1).tolist(),
-        })  # fmt: skip
+        one = {"name": line.name, "marked": line.marked, "time": _bits(line.time, *time)}
+        one |= {"place": _bits(along, *place), "speed": _bits(line.speed, 0.0, fastest)}
+        packed.append(one | {"breaks": (np.flatnonzero(~line.whole(panel.ring_length)) + 1).tolist()})
     offsets, names = axes_of(panel, together)
     return {"title": panel.title, "time": time, "place": place, "vehicles": packed, "offsets": offsets, "names": names}
 

@@ -22,11 +22,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SIMULATE = "simulate {data} --model {out}/model.yaml"
-NEXT = {
-    "plot": "fit {data}", "filter": "fit {out}/trajectories.parquet", "reconstruct": "fit {out}/trajectories.parquet",
-    "fit": "explain {data}", "raw": "filter {data}", "explain": _SIMULATE, "each": "explain {data}",
-    "demo": _SIMULATE, "simulate": "drift {data}", "drift": _SIMULATE, "lost": "plot {data}",
-}  # fmt: skip
+NEXT = {"plot": "fit {data}", "raw": "filter {data}", "simulate": "drift {data}", "lost": "plot {data}"}
+NEXT |= dict.fromkeys(("filter", "reconstruct"), "fit {out}/trajectories.parquet")
+NEXT |= dict.fromkeys(("fit", "each"), "explain {data}") | dict.fromkeys(("explain", "demo", "drift"), _SIMULATE)
 """Next command by command: "lost" of one without a model, "raw" of a fit to noisy positions."""
 
 
@@ -157,10 +155,8 @@ def write_page(
 
     here = Path(__file__).with_name("page.html")
     template = template or here
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, extensions=["jinja2.ext.do"],
-        loader=FileSystemLoader([here.parent, template.parent]),
-    )  # fmt: skip
+    loader = FileSystemLoader([here.parent, template.parent])
+    environment = Environment(autoescape=True, undefined=StrictUndefined, extensions=["jinja2.ext.do"], loader=loader)
     environment.filters |= filters or {}
     environment.globals["table_of"] = table
     page = environment.get_template(template.name).render(

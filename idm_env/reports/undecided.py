@@ -30,14 +30,11 @@ def write(trajectories: Trajectories, cure: str, out: Path, inputs: Iterable[Pat
     The report has the keys of every report of ``explain``; there is no model.
     """
     sentence = f"{trajectories.source} is one recording, so no run can be held out as a test set. {cure}"
-    report: dict[str, Any] = {
-        "verdict": "cannot_tell", "reason": "few_runs", "sentence": sentence, "details": [cure], "found": [],
-        "known": [], "helps": {}, "ladder": None, "interval": None, "models": {}, "partial": None, "candidates": [],
-        "shared": None,
-        "error": {"held_out_runs": [], "held_out_drivers": [], "before": None, "after": None}, "excluded": [],
-        "parameters": [], "data": trajectories.summary(), "prior": None, "bases": [], "completed": None, "fleet": None,
-        "versions": page.versions(),
-    }  # fmt: skip
+    report: dict[str, Any] = {"verdict": "cannot_tell", "reason": "few_runs", "sentence": sentence, "details": [cure]}
+    report |= {"found": [], "known": [], "helps": {}, "ladder": None, "interval": None, "models": {}, "partial": None}
+    report |= {"candidates": [], "shared": None, "excluded": [], "parameters": [], "data": trajectories.summary()}
+    report["error"] = {"held_out_runs": [], "held_out_drivers": [], "before": None, "after": None}
+    report |= {"prior": None, "bases": [], "completed": None, "fleet": None, "versions": page.versions()}
     cards = [
         ("Recordings", "", "1"),
         ("Drivers behind a leader", "", str(len(trajectories.followers()))),

@@ -107,10 +107,8 @@ class Sideways(Ending):
         back = position - length - self.at(position, follower) + to_follower
         if state.present is not None:
             exists = exists & (state.present > 0)
-        return Side(
-            exists, leader, follower, led, followed,
-            torch.where(led, ahead, FAR), torch.where(followed, back, FAR), ends,
-        )  # fmt: skip
+        gap, back_gap = torch.where(led, ahead, FAR), torch.where(followed, back, FAR)
+        return Side(exists, leader, follower, led, followed, gap, back_gap, ends)
 
     def before_end(self, leader: Neighbour, ends: Tensor) -> Neighbour:
         """Return whichever is nearer to each vehicle: its leader on a lane, or a standing one at the end of it."""

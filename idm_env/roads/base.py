@@ -27,7 +27,7 @@ class Outline(NamedTuple):
 
 
 def if_present(other: Neighbour, speed: Tensor) -> Neighbour:
-    """Return a neighbour, and where there is none nobody: FAR away, at one's own ``speed`` (m/s); elementwise."""
+    """Return a neighbour, elementwise; where it is absent gap FAR, one's own ``speed`` (m/s), acceleration 0."""
     exists = other.present > 0
     return Neighbour(
         torch.where(exists, other.gap, FAR),

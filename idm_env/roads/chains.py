@@ -17,7 +17,7 @@ from idm_env.types import State
 
 
 class Places(NamedTuple):
-    """Which slot every place of a layout is a copy of, and at which place a slot itself is; who leads and is led.
+    """Layout of chains: slot of every place, place of every slot, has a leader, has a follower (bool), end of lane (m).
 
     ``slots``, ``led``, ``leads`` and ``ends`` (m; where a standing leader is) have shape ``(..., places)``, ``own``
     ``(..., vehicles)``.

@@ -47,7 +47,7 @@ def standing(state: State) -> Moving:
 
 
 def without_absent(links: LaneState, present: Tensor | None) -> LaneState:
-    """Return links in which nobody follows who has left: his slot may be another vehicle's before long."""
+    """Return links that no longer lead to absent vehicles, whose slots may be reused."""
     if present is None:
         return links
     own = torch.arange(present.shape[-1], device=present.device).expand_as(present)
@@ -212,24 +212,19 @@ class Linked(Sideways):
         return Order.built(position, origin, leaving.to(position.dtype), self.road.count, self.road.ring)
 
     def with_leaving(self, state: State, sides: tuple[Side, Side]) -> tuple[Side, Side]:
-        """Return the lanes beside with those who are still leaving them, wherever they are nearer."""
+        """Return the adjacent lanes; vehicles still changing out of them are neighbours where they are nearer."""
         order, lanes = self._leaving(state), []
         for side, step in zip(sides, (1, -1), strict=True):
-            a = order.around(self.to(step), state.position)
-            other = self.look(
-                state, side.exists, a.leader, a.follower, a.led, a.followed, a.to_leader, a.to_follower, side.ends
-            )
+            other = self.look(state, side.exists, *order.around(self.to(step), state.position), side.ends)
             ahead, behind = other.gap < side.gap, other.back_gap < side.back_gap
-            lanes.append(side._replace(
-                leader=torch.where(ahead, other.leader, side.leader), led=side.led | ahead,
-                follower=torch.where(behind, other.follower, side.follower), followed=side.followed | behind,
-                gap=torch.where(ahead, other.gap, side.gap),
-                back_gap=torch.where(behind, other.back_gap, side.back_gap),
-            ))  # fmt: skip
+            leader, led = torch.where(ahead, other.leader, side.leader), side.led | ahead
+            follower, followed = torch.where(behind, other.follower, side.follower), side.followed | behind
+            gap, back_gap = torch.where(ahead, other.gap, side.gap), torch.where(behind, other.back_gap, side.back_gap)
+            lanes.append(Side(side.exists, leader, follower, led, followed, gap, back_gap, side.ends))
         return lanes[0], lanes[1]
 
     def on_the_way(self, before: State, after: State, claim: Claim, steps: int, turn: Tensor) -> State:
-        """Return the state after a decision in which those who were granted a change take some steps for it.
+        """Return the state after a decision whose granted lane changes last ``steps`` steps.
 
         ``turn`` (bool, ``(…, 1)``) are the rows that decide.
         """
@@ -272,11 +267,8 @@ class Linked(Sideways):
         position, lane = self.position, self.links_now.lane
         to = self.to(step)
         around = order.around(to, position)
-        return self.look(
-            state, self.road.open_between(lane, lane + step, position, state.length), around.leader, around.follower,
-            around.led, around.followed, around.to_leader, around.to_follower,
-            self.road.closed_at(to, position) - position,
-        )  # fmt: skip
+        is_open = self.road.open_between(lane, lane + step, position, state.length)
+        return self.look(state, is_open, *around, self.road.closed_at(to, position) - position)
 
     def chosen(self, sides: tuple[Side, Side], prefers: Preference, due: Tensor) -> Claim:
         """Return the outcome of every wish: per gap the best claim is granted.
@@ -301,10 +293,8 @@ class Linked(Sideways):
         granted = granted & (own == _most(room, gap, torch.where(granted, own, count), "amin"))
         follower = torch.where(to_left, left.follower, right.follower)
         judged = torch.where(to_left, left.followed, right.followed)
-        return Claim(
-            torch.where(granted, to, self.links_now.lane), granted, wants & ~granted, blocked, follower, judged,
-            torch.where(due & ~granted, signals, 0.0),
-        )  # fmt: skip
+        lane, refused = torch.where(granted, to, self.links_now.lane), wants & ~granted
+        return Claim(lane, granted, refused, blocked, follower, judged, torch.where(due & ~granted, signals, 0.0))
 
     def mergers(self, state: State, sides: tuple[Side, Side], claim: Claim) -> Tensor:
         """Return for each vehicle the slot of the vehicle signalling to merge ahead of it; its own slot if none.

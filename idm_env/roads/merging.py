@@ -19,7 +19,7 @@ LANE = "on_lane"
 
 
 def nobody(like: Tensor) -> dict[str, Tensor]:
-    """Return the memories of drivers beside whom nobody signals."""
+    """Return the memories of drivers without a merging vehicle beside them."""
     return {MERGER_GAP: torch.full_like(like, FAR), MERGER_SPEED: torch.zeros_like(like)}
 
 
@@ -35,7 +35,7 @@ def merger(memory: Memory, speed: Tensor) -> Neighbour:
 
 
 def on_lanes(state: State) -> State:
-    """Return the state in which drivers remember on which lanes they are, where some effect looks at that."""
+    """Return the state with each driver's lane in memory, if an effect reads it."""
     if LANE not in state.memory:
         return state
     assert state.lanes is not None

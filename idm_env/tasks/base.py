@@ -233,12 +233,12 @@ class Task(abc.ABC):
 
     @property
     def shares(self) -> int:
-        """Agents among whose rewards the mean spreads the cost of a crash: 1 where all crash together."""
+        """Number of agents that share the cost of a crash by the mean of their rewards: 1 if all crash together."""
         return 1
 
     @property
     def journeys(self) -> int:
-        """The most trips of an agent's slot in an episode; 0 where agents are there from its beginning on."""
+        """Most trips of an agent's slot in an episode; 0 for agents that are on the road from the start."""
         return 0
 
     @property
@@ -442,7 +442,7 @@ class Task(abc.ABC):
         return mapped(lambda x, y: torch.where(rows.view(-1, *[1] * (x.dim() - 1)), y, x), world, begun)
 
     def who(self, draw: Draw) -> dict[str, Tensor]:
-        """Return which of the drivers every vehicle is in these episodes, and where in their ranges parameters are."""
+        """Return each vehicle's driver (index) in these episodes, and drawn places of parameters in their ranges."""
         episode = {}
         if self._behaviour.drivers:
             count = len(next(iter(self._behaviour.drivers.values())))
@@ -565,7 +565,7 @@ class Task(abc.ABC):
         return {**inputs, **(normals or {})}
 
     def with_lane_commands(self, inputs: Inputs, action: Tensor | None, live: Tensor | None = None) -> Inputs:
-        """Return the inputs of a step with what agents command beside accelerations, where they do."""
+        """Return the inputs of a step with the agents' lane commands, if they have any."""
         return inputs
 
     def step(

@@ -162,10 +162,8 @@ class LanesTask(Task):
     def own_features(self) -> tuple[Feature, ...]:
         """What is seen of oneself, and of each vehicle nearby: relative to the agent, 0 where there is nobody."""
         last = float(max(self.road.count - 1, 1))
-        each = (
-            ("there", "", 1.0, 0.0, 1.0), ("ahead", "m", 100.0, -FAR_AWAY, FAR_AWAY),
-            ("left", "lanes", 1.0, -last, last), ("speed", "m/s", 10.0, -FASTEST, FASTEST),
-        )  # fmt: skip
+        place = ("there", "", 1.0, 0.0, 1.0), ("ahead", "m", 100.0, -FAR_AWAY, FAR_AWAY)
+        each = (*place, ("left", "lanes", 1.0, -last, last), ("speed", "m/s", 10.0, -FASTEST, FASTEST))
         nearby = (
             Feature(f"{name}_{k}", "", unit, scale, low, high, partial(_nearby, i, k))
             for k in range(self.seen)
@@ -178,7 +176,7 @@ class LanesTask(Task):
         return ahead
 
     def nearest(self, state: State) -> tuple[Tensor, ...]:
-        """Return of the ``seen`` nearest vehicles who is there, how far ahead (m), lanes to the left, relative speed.
+        """Return presence, distance ahead (m), lanes to the left and relative speed of the ``seen`` nearest vehicles.
 
         Each ``(…, seen, agents)``, 0 for nobody.
         """

@@ -107,10 +107,9 @@ def _tracks(table: Any, runs: Sequence[str], dt: float) -> list[Track]:
 
         run, leader = part["run_id"][0], np.full(step.max() + 1, "", object)
         leader[steps] = ["" if x is None else f"{run}/{x}" for x in part["leader_id"]]
-        tracks.append(Track(
-            key, f"{run}/{part['lane'][0]}", float(part["length_m"][0]), laid("position_m"), laid("speed_mps"),
-            laid("gap_m"), laid("gap_measured") == 1.0, leader, laid("lane"),
-        ))  # fmt: skip
+        motion, length = (laid("position_m"), laid("speed_mps"), laid("gap_m")), float(part["length_m"][0])
+        lane, measured = f"{run}/{part['lane'][0]}", laid("gap_measured") == 1.0
+        tracks.append(Track(key, lane, length, *motion, measured, leader, laid("lane")))
     return tracks
 
 

@@ -123,11 +123,9 @@ def flows(where: str, given: Any) -> dict[int, list[tuple[float, float]]]:
     return dict(sorted(result.items()))
 
 
-KEYS: Mapping[str, Key] = {
-    "per_hour": Key(flows), "seconds": Key(Range(0.0, 1e9, "s"), 600.0), "seed": Key(Range(0, 1e18, whole=True), 0),
-    "speed": Key(Range(1.0, 100.0, "m/s"), ENTRY_SPEED), "classes": Key(by_name, None),
-    "destinations": Key(by_name, None),
-}  # fmt: skip
+KEYS = {"per_hour": Key(flows), "seconds": Key(Range(0.0, 1e9, "s"), 600.0)}
+KEYS |= {"seed": Key(Range(0, 1e18, whole=True), 0), "speed": Key(Range(1.0, 100.0, "m/s"), ENTRY_SPEED)}
+KEYS |= {"classes": Key(by_name, None), "destinations": Key(by_name, None)}
 """What ``trips`` takes in place of a table: the arguments of ``table``."""
 
 
@@ -162,11 +160,9 @@ def table(
         raise ValueError(f"per_hour = {shown(dict(per_hour))} lets nobody depart within {seconds:g} s.")
     rows.sort()
     who = torch.rand(2, len(rows), generator=generator).tolist()
-    return {
-        "depart": [time for time, _ in rows], "lane": [lane for _, lane in rows], "speed": [speed] * len(rows),
-        "class": _of_shares("classes", classes or {}, who[0]),
-        "destination": _of_shares("destinations", destinations or {}, who[1]),
-    }  # fmt: skip
+    kind, place = _of_shares("classes", classes or {}, who[0]), _of_shares("destinations", destinations or {}, who[1])
+    times, lanes = [time for time, _ in rows], [lane for _, lane in rows]
+    return {"depart": times, "lane": lanes, "speed": [speed] * len(rows), "class": kind, "destination": place}
 
 
 def shares(name: str, given: Mapping[str, float]) -> None:

@@ -1,8 +1,8 @@
 """One chunk of tracks: filtered or imitated, compared with the baselines, and written as a part."""
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -20,21 +20,17 @@ Recipe = Literal["default", "paper"]
 CHUNK = 200
 OURS = {"default": "simulator, imagined leader", "paper": "the paper's recipe"}
 TRAJECTORIES, PARAMETERS = "trajectories", "parameters"
-SCHEMA: dict[str, Any] = {
-    "run_id": pl.String, "vehicle_id": pl.String, "piece": pl.Int32, "leader_id": pl.String, "lane": pl.Int64,
-    "time_s": pl.Float64, "position_m": pl.Float64, "speed_mps": pl.Float64, "accel_mps2": pl.Float64,
-    "length_m": pl.Float64, "gap_m": pl.Float64, "imagined_gap_m": pl.Float64, "position_sigma_m": pl.Float64,
-    "speed_sigma_mps": pl.Float64, "accel_sigma_mps2": pl.Float64,
-}  # fmt: skip
-PARAMETER_SCHEMA: dict[str, Any] = {
-    "run_id": pl.String, "vehicle_id": pl.String, "piece": pl.Int64, "source": pl.String,
-    **dict.fromkeys(paper.NAMES, pl.Float64),
-    **{f"{name}_error": pl.Float64 for name in paper.NAMES},
-    **{f"{name}_identified": pl.Boolean for name in paper.NAMES},
-}  # fmt: skip
+MOTION = tuple(field.name for field in dataclasses.fields(RegularMotion))
+SIGMAS = ("position_sigma_m", "speed_sigma_mps", "accel_sigma_mps2")
+SCHEMA: dict[str, Any] = {"run_id": pl.String, "vehicle_id": pl.String, "piece": pl.Int32, "leader_id": pl.String}
+SCHEMA |= {"lane": pl.Int64, **dict.fromkeys((*MOTION, "length_m", "gap_m", "imagined_gap_m", *SIGMAS), pl.Float64)}
+PARAMETER_SCHEMA: dict[str, Any] = {"run_id": pl.String, "vehicle_id": pl.String, "piece": pl.Int64}
+PARAMETER_SCHEMA |= {"source": pl.String, **dict.fromkeys(paper.NAMES, pl.Float64)}
+PARAMETER_SCHEMA |= {f"{name}_error": pl.Float64 for name in paper.NAMES}
+PARAMETER_SCHEMA |= {f"{name}_identified": pl.Boolean for name in paper.NAMES}
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class FilterSettings:
     """Settings of a run: task, step (s; None takes the file's), recipe, ablation, baselines, vehicles per chunk.
 
@@ -50,7 +46,7 @@ class FilterSettings:
     model: str | None = None
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class FilePlan:
     """Decisions for the whole file: step (s), noise, and whether samples are dense; ``seconds`` it took."""
 
@@ -128,14 +124,11 @@ def _table(filtered: Sequence[Filtered]) -> pl.DataFrame:
     frames = []
     for f in filtered:
         count = len(f.motion.time_s)
-        columns: dict[str, Any] = {
-            "run_id": [f.track.run_id] * count, "vehicle_id": [f.track.vehicle_id] * count,
-            "piece": np.full(count, f.track.piece), "leader_id": f.leader.tolist(), "lane": f.lane.astype(np.int64),
-            "time_s": f.motion.time_s, "position_m": f.motion.position_m, "speed_mps": f.motion.speed_mps,
-            "accel_mps2": f.motion.accel_mps2, "length_m": np.full(count, f.track.length_m), "gap_m": f.gap,
-            "imagined_gap_m": f.imagined_gap, "position_sigma_m": f.sigma[:, 0], "speed_sigma_mps": f.sigma[:, 1],
-            "accel_sigma_mps2": f.sigma[:, 2],
-        }  # fmt: skip
+        columns: dict[str, Any] = {"run_id": [f.track.run_id] * count, "vehicle_id": [f.track.vehicle_id] * count}
+        columns |= {"piece": np.full(count, f.track.piece), "leader_id": f.leader.tolist()}
+        columns |= {"lane": f.lane.astype(np.int64), **{name: getattr(f.motion, name) for name in MOTION}}
+        columns |= {"length_m": np.full(count, f.track.length_m), "gap_m": f.gap, "imagined_gap_m": f.imagined_gap}
+        columns |= dict(zip(SIGMAS, f.sigma.T, strict=True))
         frames.append(pl.DataFrame(columns, schema=SCHEMA))
     table = pl.concat(frames) if frames else pl.DataFrame(schema=SCHEMA)
     floats = [name for name, kind in SCHEMA.items() if kind == pl.Float64]
@@ -153,9 +146,8 @@ def restored(parts: Parts, number: int, tracks: Sequence[TrackPiece]) -> list[Fi
     filtered = []
     for track in tracks:
         rows = by_key[(track.run_id, track.vehicle_id, track.piece)]
-        sigma = rows.select("position_sigma_m", "speed_sigma_mps", "accel_sigma_mps2").to_numpy()
-        filtered.append(Filtered(
-            track, RegularMotion.from_table(rows), rows["imagined_gap_m"].to_numpy(), sigma,
-            rows["leader_id"].fill_null("").to_numpy(), rows["lane"].fill_null(-1).to_numpy(), rows["gap_m"].to_numpy(),
-        ))  # fmt: skip
+        motion, sigma = RegularMotion.from_table(rows), rows.select(SIGMAS).to_numpy()
+        leader, lane = rows["leader_id"].fill_null("").to_numpy(), rows["lane"].fill_null(-1).to_numpy()
+        gap, imagined_gap = rows["gap_m"].to_numpy(), rows["imagined_gap_m"].to_numpy()
+        filtered.append(Filtered(track, motion, imagined_gap, sigma, leader, lane, gap))
     return filtered

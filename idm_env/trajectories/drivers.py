@@ -43,10 +43,9 @@ def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]
     ahead = VehicleRecord(position + filtered.gap[part] + length, speeds, accels, length, ~nobody)
     far = [VehicleRecord(position + away, speed, np.zeros(end - begin), 4.5, nobody) for away in (FAR_M, -FAR_M, FAR_M)]
     track = filtered.track
-    return Episode(
-        track.run_id, track.vehicle_id, str(filtered.leader[begin]), track.key, dt, time, position, speed,
-        filtered.gap[part], track.length_m, ahead, far[0], far[1], far[2], position, {}, {},
-    )  # fmt: skip
+    names = track.run_id, track.vehicle_id, str(filtered.leader[begin]), track.key
+    own = time, position, speed, filtered.gap[part]
+    return Episode(*names, dt, *own, track.length_m, ahead, far[0], far[1], far[2], position, {}, {})
 
 
 def _stretches(leader: np.ndarray, usable: np.ndarray) -> list[tuple[int, int]]:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import polars as pl
@@ -31,7 +31,7 @@ from idm_env.trajectories.recipe import Filtered, recipe
 from idm_env.trajectories.report import write_report
 from idm_env.trajectories.scores import RegularMotion, Tally
 from idm_env.trajectories.smoother import PositionNoise
-from idm_env.trajectories.spool import Shelf, Spool
+from idm_env.trajectories.spool import Reading, Shelf, Spool
 from idm_env.trajectories.tracks import Pieces, TrackPiece
 
 OUTPUT = ("trajectories.parquet", "parameters.parquet", "report.json", "report.html")
@@ -39,14 +39,6 @@ SAMPLED = 64
 """Vehicles that noise and step are taken from."""
 SHOWN = 4
 """Tracks of which the report has pictures."""
-
-
-class Reading(NamedTuple):
-    """How a file is read: see ``data.load``."""
-
-    layout: str = "auto"
-    columns: Columns = None
-    ring_length: float | None = None
 
 
 def filter_file(
@@ -114,13 +106,13 @@ def _run(
     mark = storage.fingerprint(settings, how, stamp(path), model)
     parts = Parts(out / storage.UNFINISHED / settings.task, mark, resume)
     try:
-        spool = Spool(path, parts.folder / "spool", how.layout, settings.chunk, how.ring_length, how.columns)
+        spool = Spool(path, parts.folder / "spool", settings.chunk, how)
         bridge = 2.0 if settings.task == "filter" else None
         plan = _plan(spool, settings, bridge)
     except DataError:
         parts.remove()  # nothing of it could go on
         raise
-    _chunks(spool, parts, settings, plan, bridge, executor, progress)
+    _chunks([_Strand(n, spool.shelf, parts, settings, plan, bridge) for n in spool.strands()], executor, progress)
     summaries = parts.summaries()
     scored = []
     if settings.task == "reconstruct":
@@ -157,18 +149,14 @@ class _Strand:
         return self.shelf.borders[self.numbers[0]], self.shelf.borders[self.numbers[-1] + 1]
 
 
-def _chunks(
-    spool: Spool, parts: Parts, settings: FilterSettings, plan: FilePlan, bridge: float | None, executor: Executor,
-    progress: OnProgress,
-) -> None:  # fmt: skip
+def _chunks(strands: Sequence[_Strand], executor: Executor, progress: OnProgress) -> None:
     """Do all chunks that are not done yet, a strand wherever the executor has room for it."""
-    strands = [_Strand(numbers, spool.shelf, parts, settings, plan, bridge) for numbers in spool.strands()]
-    missing = [s for s in strands if not all(parts.done(number) for number in s.numbers)]
-    everybody = len(spool.vehicles)
+    missing = [s for s in strands if not all(s.parts.done(number) for number in s.numbers)]
+    task, everybody = strands[0].settings.task, strands[0].shelf.borders[-1]
     done = everybody - sum(s.vehicles[1] - s.vehicles[0] for s in missing)
     for index, _ in executor.map(_strand, missing, progress):
         done += missing[index].vehicles[1] - missing[index].vehicles[0]
-        progress(settings.task, done, everybody, "")
+        progress(task, done, everybody, "")
 
 
 def _strand(strand: _Strand, progress: OnProgress) -> None:
@@ -184,12 +172,11 @@ def _strand(strand: _Strand, progress: OnProgress) -> None:
             recent += chunks.restored(parts, number, tracks)
         else:
             remarks = {"left_out": pieces.left_out, "notes": pieces.notes}
-            recent += chunks.done(
-                parts, number, tracks, settings, strand.plan, recent, remarks,
-                lambda share, words, b=begin, e=end: progress(  # type: ignore[misc]
-                    settings.task, b + int(share * (e - b)), borders[-1], words
-                ),
-            )  # fmt: skip
+
+            def report(share: float, words: str, begin: int = begin, end: int = end) -> None:
+                progress(settings.task, begin + int(share * (end - begin)), borders[-1], words)
+
+            recent += chunks.done(parts, number, tracks, settings, strand.plan, recent, remarks, report)
         progress(settings.task, end, borders[-1], "")
 
 

@@ -54,12 +54,9 @@ def _sample_vehicles(count: int) -> list[int]:
 def _row(
     name: str, motions: list[RegularMotion], tracks: list[TrackPiece], out: tuple[np.ndarray, ...], spacing: float
 ) -> dict[str, Any]:
-    apart = np.concatenate([
-        motion.position_at(track.time_s[index]) - track.position_m[index]
-        for motion, track, index in zip(motions, tracks, out, strict=True)
-    ])  # fmt: skip
-    return {
-        "method": name, "tracks": len(tracks), "points": len(apart), "spacing_s": spacing,
-        "rmse_m": float(np.sqrt(np.mean(apart**2))), "mae_m": float(np.abs(apart).mean()),
-        "p95_m": float(np.percentile(np.abs(apart), 95)), "bias_m": float(apart.mean()),
-    }  # fmt: skip
+    triples = zip(motions, tracks, out, strict=True)
+    apart = np.concatenate([motion.position_at(track.time_s[i]) - track.position_m[i] for motion, track, i in triples])
+    size = np.abs(apart)
+    row = {"method": name, "tracks": len(tracks), "points": len(apart), "spacing_s": spacing}
+    row |= {"rmse_m": float(np.sqrt(np.mean(apart**2))), "mae_m": float(size.mean())}
+    return row | {"p95_m": float(np.percentile(size, 95)), "bias_m": float(apart.mean())}

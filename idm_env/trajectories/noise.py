@@ -112,8 +112,6 @@ class _Search:
 
         first = np.log([getattr(begin, name) for name in names])
         simplex = np.vstack([first, first + 0.7 * np.eye(len(names))])
-        optimum = minimize(
-            cost, first, method="Nelder-Mead",
-            options={"maxfev": self.evaluations, "xatol": 0.03, "fatol": 0.3, "initial_simplex": simplex},
-        )  # fmt: skip
+        options = {"maxfev": self.evaluations, "xatol": 0.03, "fatol": 0.3, "initial_simplex": simplex}
+        optimum = minimize(cost, first, method="Nelder-Mead", options=options)
         return noise(optimum.x), float(optimum.fun)

@@ -131,9 +131,8 @@ def _imitated(
 
 
 def follow(
-    position_m: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float, *,
-    iterations: int = ITERATIONS,
-) -> np.ndarray:  # fmt: skip
+    position_m: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float, iterations: int = ITERATIONS
+) -> np.ndarray:
     """Return the five values fitted behind a real leader to positions [K] every ``dt`` (s), by the same optimisation.
 
     This is the recipe of prediction: nothing is imagined. ``rear_m`` and ``pace`` [K] are the leader's rear bumper (m)
@@ -170,11 +169,8 @@ def _descended(
     speed = torch.tensor(speed0, dtype=torch.float64)[:, None]
     state = simulator.state(torch.zeros_like(speed), speed, params)
     sizes = [len(x) for x in steps]
-    observed = Observed(
-        np.concatenate([np.empty(0, np.int64), *steps]), np.repeat(np.arange(len(steps)), sizes),
-        np.concatenate([[], *targets]), np.repeat([1.0 / size for size in sizes], sizes),
-    )  # fmt: skip
-    return descend(
-        simulator, state, {leader.name: ahead}, params, len(ahead[0]), observed, bounds,
-        iterations=iterations, rates=RATES,
-    )  # fmt: skip
+    step, row = np.concatenate([np.empty(0, np.int64), *steps]), np.repeat(np.arange(len(steps)), sizes)
+    weight = np.repeat([1.0 / size for size in sizes], sizes)
+    observed = Observed(step, row, np.concatenate([[], *targets]), weight)
+    call = simulator, state, {leader.name: ahead}, params, len(ahead[0]), observed, bounds
+    return descend(*call, iterations=iterations, rates=RATES)

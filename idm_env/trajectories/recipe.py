@@ -124,13 +124,11 @@ def recipe(
     positions = [*(d.position for d in driven), *fixed]
     for m in meetings:
         gaps[m.follower][m.steps] = _gap(m, around, positions)
-    return [
-        Filtered(
-            track, RegularMotion(clock, d.position, d.speed, d.accel), d.gap, s.sigma, around.leaders[i],
-            track.lane[nearest(track, clock)], gaps[i],
-        )
-        for i, (track, clock, d, s) in enumerate(zip(tracks, clocks, driven, smoothed, strict=True))
-    ]  # fmt: skip
+    filtered = []
+    for i, (track, clock, d, s) in enumerate(zip(tracks, clocks, driven, smoothed, strict=True)):
+        motion, lane = RegularMotion(clock, d.position, d.speed, d.accel), track.lane[nearest(track, clock)]
+        filtered.append(Filtered(track, motion, d.gap, s.sigma, around.leaders[i], lane, gaps[i]))
+    return filtered
 
 
 def _smoothed(observed: Sequence[TrackObservations], noise: PositionNoise, options: SmootherOptions) -> list[Smoothed]:

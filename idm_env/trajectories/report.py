@@ -102,9 +102,8 @@ def _parameters(parameters: pl.DataFrame) -> list[dict[str, Any]]:
         finite = parameters.filter(pl.col(p.name).is_not_null())
         low, middle, high = np.percentile(finite[p.name].to_numpy(), [25, 50, 75])
         identified = finite[f"{p.name}_identified"].drop_nulls()
-        rows.append({
-            "parameter": f"{p.symbol} {p.name}", "unit": p.unit, "median": float(middle),
-            "quartiles": f"{low:.2f} – {high:.2f}", "tracks": finite.height,
-            "identified": f"{100 * identified.to_numpy().mean():.0f} %" if len(identified) else "–",
-        })  # fmt: skip
+        share = f"{100 * identified.to_numpy().mean():.0f} %" if len(identified) else "–"
+        row = {"parameter": f"{p.symbol} {p.name}", "unit": p.unit, "median": float(middle)}
+        row |= {"quartiles": f"{low:.2f} – {high:.2f}", "tracks": finite.height, "identified": share}
+        rows.append(row)
     return rows

@@ -184,18 +184,13 @@ def _fitted(
     if push is None:
         push = np.full(observed.steps, scale)
     half = max(1, round(0.5 * options.window / observed.dt))
+    seen, prior = (observed.at, observed.look, observed.value), (start, spread, observed.dt, keep, fade, push, drift)
     for turn in range(rounds):
-        loops.smooth(
-            observed.at, observed.look, observed.value, variance, start, spread, observed.dt,
-            keep, fade, push, drift, mean, cov, square,
-        )  # fmt: skip
+        loops.smooth(*seen, variance, *prior, mean, cov, square)
         if turn == rounds - 1:
             break
         if options.degrees is not None:
-            loops.reweigh(
-                observed.at, observed.look, observed.value, mean, cov, white, options.degrees, observed.measured,
-                variance,
-            )  # fmt: skip
+            loops.reweigh(*seen, mean, cov, white, options.degrees, observed.measured, variance)
         if adapting and options.jerk_degrees is not None:
             loops.adapt(square, push, half, options.jerk_degrees, scale)
     return mean, cov, push

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import polars as pl
 
@@ -27,6 +28,14 @@ BUCKET_ROWS = 400_000
 """Rows of a bucket of times."""
 LONGEST_STEP_S = 60.0
 """Sparse tracks have a sample at least so often (s); above, times are in another unit."""
+
+
+class Reading(NamedTuple):
+    """How a file is read: see ``data.load``."""
+
+    layout: str = "auto"
+    columns: Columns = None
+    ring_length: float | None = None
 
 
 @dataclass(frozen=True)
@@ -71,17 +80,14 @@ class Spool:
         repairs: What was repaired.
     """
 
-    def __init__(
-        self, path: str | Path, folder: Path, layout: str, chunk: int, ring_length: float | None = None,
-        columns: Columns = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, path: str | Path, folder: Path, chunk: int, how: Reading = Reading()) -> None:  # noqa: B008
         self.source = Path(path).name
         self.folder = folder
         self._counted = Counted()
         if folder.exists():
             shutil.rmtree(folder)
         folder.mkdir(parents=True)
-        files, index = self._read(path, layout, ring_length, columns)
+        files, index = self._read(path, how)
         self.vehicles: list[tuple[str, str]] = index.select(TRACK).rows()
         self.shelf = Shelf(self.source, folder, _borders([run for run, _ in self.vehicles], chunk))
         chunks = pl.Series(self.shelf.borders[1:-1], dtype=pl.UInt32)
@@ -107,17 +113,15 @@ class Spool:
         """Yield the tables of single vehicles."""
         yield from map(self.shelf.vehicle, indices)
 
-    def _read(
-        self, path: str | Path, layout: str, ring_length: float | None, columns: Columns
-    ) -> tuple[list[Path], pl.DataFrame]:
+    def _read(self, path: str | Path, how: Reading) -> tuple[list[Path], pl.DataFrame]:
         """Write the pieces of a file and return them, with an index of its vehicles in their order."""
         files: list[Path] = []
         parts: list[pl.DataFrame] = []
         filled = clean.Filled()
         sample: list[pl.DataFrame] = []
-        for piece, repairs in batches(path, layout=layout, columns=columns):
+        for piece, repairs in batches(path, layout=how.layout, columns=how.columns):
             self._counted.add(repairs)
-            usable, repairs = prepare.rows(piece, self.source, ring_length, filled)
+            usable, repairs = prepare.rows(piece, self.source, how.ring_length, filled)
             self._counted.add(repairs)
             rows = usable.filter(pl.col("position_m").is_not_null())
             lost = usable.height - rows.height
@@ -236,7 +240,7 @@ class Spool:
 def read_table(path: str | Path, layout: str = "auto") -> Table:
     """Return a whole file as one table, by the rules of ``Spool``, whose DataErrors it raises."""
     with TemporaryDirectory() as folder:
-        spool = Spool(path, Path(folder) / "spool", layout, 200)
+        spool = Spool(path, Path(folder) / "spool", 200, Reading(layout))
         return Table(pl.concat([spool.shelf.table(n).frame for n in range(spool.chunks)]), spool.source, spool.repairs)
 
 
@@ -275,21 +279,18 @@ def _indexed(piece: pl.DataFrame) -> pl.DataFrame:
     """
     time = pl.col("time_s")
     ring = pl.col("ring_length_m").is_not_null().any() if "ring_length_m" in piece.columns else pl.lit(False)
-    return piece.group_by(TRACK, maintain_order=True).agg(
-        *directions.END, directions.lane_of(piece), pl.len().cast(pl.Int64).alias("rows"), time.first().alias("first"),
-        time.last().alias("last"), (time.diff() < 0).sum().cast(pl.Int64).alias("backward"), ring.alias("ring"),
-    )  # fmt: skip
+    facts = {"rows": pl.len().cast(pl.Int64), "first": time.first(), "last": time.last()}
+    facts |= {"backward": (time.diff() < 0).sum().cast(pl.Int64), "ring": ring}
+    return piece.group_by(TRACK, maintain_order=True).agg(*directions.END, directions.lane_of(piece), **facts)
 
 
 def _merged(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
     """Return the facts of each vehicle of the file."""
-    return pl.concat(parts).group_by(TRACK, maintain_order=True).agg(
-        pl.col("begin").min(), pl.col("end").max(), pl.col("from").sort_by("begin").first(),
-        pl.col("to").sort_by("end").last(), pl.col("rises").sum(), pl.col("lane").drop_nulls().first(),
-        pl.col("rows").sum(),
-        pl.col("backward").sum() + (pl.col("first").shift(-1) < pl.col("last")).sum().cast(pl.Int64),
-        pl.col("ring").any(),
-    )  # fmt: skip
+    c = pl.col
+    back = c("backward").sum() + (c("first").shift(-1) < c("last")).sum().cast(pl.Int64)
+    ends = c("begin").min(), c("end").max(), c("from").sort_by("begin").first(), c("to").sort_by("end").last()
+    others = c("rises").sum(), c("lane").drop_nulls().first(), c("rows").sum(), back, c("ring").any()
+    return pl.concat(parts).group_by(TRACK, maintain_order=True).agg(*ends, *others)
 
 
 def _remove(files: Iterable[Path]) -> None:

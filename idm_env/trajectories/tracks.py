@@ -6,8 +6,8 @@ regular clock. What is left out is counted, by reason.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
@@ -19,7 +19,7 @@ REVERSED_M = 3.0
 """A vehicle whose smoothed position falls by more than this drives backwards, which the simulator never does (m)."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False)
 class TrackPiece:
     """One unbroken stretch of one vehicle; arrays are [N], times rising strictly.
 
@@ -52,13 +52,11 @@ class TrackPiece:
 
     def part(self, at: slice | np.ndarray, piece: int | None = None) -> TrackPiece:
         """Return some of the samples."""
-        return TrackPiece(
-            self.run_id, self.vehicle_id, self.piece if piece is None else piece, self.time_s[at], self.position_m[at],
-            self.length_m, self.leader[at], self.lane[at],
-        )  # fmt: skip
+        cut = {name: getattr(self, name)[at] for name in ("time_s", "position_m", "leader", "lane")}
+        return dataclasses.replace(self, piece=self.piece if piece is None else piece, **cut)
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Table:
     """Rows of vehicles, each sorted by time, with ``leader_id`` ("" for none) and a length; what was repaired."""
 
@@ -85,7 +83,7 @@ class Pieces:
         self.left_out: list[tuple[str, str]] = []
         self.notes: list[tuple[str, str]] = []
         frame = table.frame
-        self._columns = {name: frame[name].to_numpy() for name in ("time_s", "position_m")}
+        self._time, self._position = (frame[name].to_numpy() for name in ("time_s", "position_m"))
         self._leader = frame["leader_id"].to_numpy()
         nowhere = np.full(frame.height, -1, np.int64)
         self._lane = frame["lane"].fill_null(-1).to_numpy() if "lane" in frame.columns else nowhere
@@ -96,10 +94,8 @@ class Pieces:
         """Yield the tracks of some vehicles, as ``vehicles`` lists them."""
         for run, vehicle, first, count in vehicles:
             rows = slice(first, first + count)
-            whole = TrackPiece(
-                run, vehicle, 0, self._columns["time_s"][rows], self._columns["position_m"][rows],
-                float(self._length[first]), self._leader[rows], self._lane[rows],
-            )  # fmt: skip
+            time, position, length = self._time[rows], self._position[rows], float(self._length[first])
+            whole = TrackPiece(run, vehicle, 0, time, position, length, self._leader[rows], self._lane[rows])
             yield from self._usable(whole)
 
     def __iter__(self) -> Iterator[TrackPiece]:

@@ -77,7 +77,7 @@ def test_filter_mirrors_too_whatever_the_pieces(tmp_path: Path, monkeypatch: pyt
     path = tmp_path / "both.parquet"
     table.write_parquet(path)
     monkeypatch.setattr(importlib.import_module("idm_env.data.load"), "BATCH_ROWS", 100)
-    made = spool.Spool(path, tmp_path / "spool", "auto", 100)
+    made = spool.Spool(path, tmp_path / "spool", 100)
     whole = read_frame(table)
     for found in (made.shelf.table(0).frame, whole.frame):
         assert {k: v - {""} for k, v in leaders(found).items()} == {

@@ -13,7 +13,7 @@ import pytest
 
 from idm_env.data import DataError, Trajectories, folder, load
 from idm_env.data.names import guessed
-from idm_env.trajectories.spool import Spool
+from idm_env.trajectories.spool import Reading, Spool
 from tests.data.tables import platoon
 from tests.test_commands_read_alike import COMMANDS, alike, read, tracks  # noqa: F401
 
@@ -89,7 +89,7 @@ def test_a_folder_takes_them(path: Path, tmp_path: Path) -> None:
     foreign().write_parquet(tmp_path / "all" / "1.parquet")
     (share,) = folder.shares(tmp_path / "all", 100, TEXT)
     alike(tracks(share.trajectories()), EXPECTED)
-    alike(tracks(Spool(tmp_path / "all", tmp_path / "spool", "auto", 2, columns=TEXT)), EXPECTED)
+    alike(tracks(Spool(tmp_path / "all", tmp_path / "spool", 2, Reading(columns=TEXT))), EXPECTED)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_folder_takes_them(path: Path, tmp_path: Path) -> None:
     ],
 )
 def test_what_names_no_column_is_one_line(path: Path, tmp_path: Path, columns: str, told: str) -> None:
-    for reader in (load, lambda given, columns: Spool(given, tmp_path / "spool", "auto", 2, columns=columns)):
+    for reader in (load, lambda given, columns: Spool(given, tmp_path / "spool", 2, Reading(columns=columns))):
         with pytest.raises(DataError) as caught:
             reader(path, columns=columns)
         assert told in str(caught.value) and "\n" not in str(caught.value)
@@ -156,7 +156,7 @@ def test_semicolons_tabs_and_decimal_commas(
     monkeypatch.setattr(importlib.import_module("idm_env.data.load"), "BATCH_BYTES", 3000)
     platoon().write_csv(tmp_path / "a.csv", separator=mark, decimal_comma=comma)
     alike(tracks(load(tmp_path / "a.csv")), EXPECTED)
-    alike(tracks(Spool(tmp_path / "a.csv", tmp_path / "spool", "auto", 2)), EXPECTED)
+    alike(tracks(Spool(tmp_path / "a.csv", tmp_path / "spool", 2)), EXPECTED)
 
 
 @pytest.mark.parametrize("how", ["clock", "comma", "date", "iso", "datetime", "time"])
@@ -195,4 +195,4 @@ def test_pairs_of_ultra_av_are_a_leader_and_a_follower(tmp_path: Path, word: str
     assert loaded.table["length_m"].unique().to_list() == pytest.approx([4.0])
     assert loaded.table.filter(pl.col("vehicle_id") == "2")["gap_m"].to_list() == pytest.approx([16.0] * 100)
     assert loaded.where("vehicle_name=3").drivers is None or loaded.where("vehicle_name=3").followers() == [("7", "2")]
-    alike(tracks(Spool(tmp_path / "pairs.csv", tmp_path / "spool", "auto", 2)), expected)
+    alike(tracks(Spool(tmp_path / "pairs.csv", tmp_path / "spool", 2)), expected)

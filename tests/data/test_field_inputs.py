@@ -16,7 +16,7 @@ import pytest
 from idm_env.cli import refusals
 from idm_env.data import DataError, Trajectories, load
 from idm_env.data.load import files_of, read
-from idm_env.trajectories.spool import Spool
+from idm_env.trajectories.spool import Reading, Spool
 from tests.commands import typed
 from tests.data.tables import kinds
 from tests.test_commands_read_alike import alike, tracks
@@ -55,7 +55,7 @@ CHAIN = {("0", None), ("1", "0"), ("2", "1")}
 
 
 def as_tracks(path: Path, tmp_path: Path, columns: str | None = None) -> Any:
-    return tracks(Spool(path, tmp_path / "spool", "auto", 2, columns=columns))
+    return tracks(Spool(path, tmp_path / "spool", 2, Reading(columns=columns)))
 
 
 def read_alike(path: Path, tmp_path: Path, columns: str | None = None) -> Trajectories:

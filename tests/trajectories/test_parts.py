@@ -32,7 +32,7 @@ def test_chunks_end_where_runs_do_unless_a_run_is_longer(runs: Path, tmp_path: P
     assert _borders(["a", "a", "b", "b", "c"], 4) == (0, 4, 5)
     assert _borders(["a", "b", "b", "b", "c"], 2) == (0, 1, 3, 5)
     assert _borders(["a"] * 5, 2) == (0, 2, 4, 5)
-    spool = Spool(runs, tmp_path / "spool", "auto", 2)
+    spool = Spool(runs, tmp_path / "spool", 2)
     assert spool.shelf.borders == (0, 2, 4, 6, 8, 9, 11)
     assert spool.strands() == [(0,), (1,), (2, 3, 4), (5,)]
     assert [spool.shelf.table(n).frame["vehicle_id"].n_unique() for n in range(6)] == [2, 2, 2, 2, 1, 2]

@@ -134,7 +134,7 @@ def test_measured_file_reads_whole(measured) -> None:  # type: ignore[no-untyped
 
 def spooled(tmp_path: Path, frame: pl.DataFrame, chunk: int = 2, name: str = "x.csv") -> Spool:
     (frame.write_csv if name.endswith("csv") else frame.write_parquet)(tmp_path / name)
-    return Spool(tmp_path / name, tmp_path / "spool", "auto", chunk)
+    return Spool(tmp_path / name, tmp_path / "spool", chunk)
 
 
 @pytest.mark.parametrize("name", ["x.csv", "x.parquet"])
@@ -202,7 +202,7 @@ SPOOLING = """
 import resource, sys
 from pathlib import Path
 from idm_env.trajectories.spool import Spool
-spool = Spool(sys.argv[1], Path(sys.argv[2]), "auto", 100)
+spool = Spool(sys.argv[1], Path(sys.argv[2]), 100)
 rows = sum(spool.shelf.table(number).frame.height for number in range(spool.chunks))
 print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 """
