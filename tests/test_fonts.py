@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 from matplotlib import font_manager
 
-from idm_env.reports import fonts, page
+from idm_env.reports import page
 from idm_env.reports.diagrams import space_time
 
 
@@ -52,7 +52,7 @@ def test_a_name_that_the_default_font_lacks_is_drawn_with_one_that_has_it(monkey
     entries = [SimpleNamespace(name=name.removesuffix(".ttf"), fname=name) for name in charmaps]
     monkeypatch.setattr(font_manager.fontManager, "ttflist", entries)
     assert default not in charmaps
-    fonts.legible(figure)
+    page.legible(figure)
     for text in (axes[0, 0].title, axes[0, 0].get_xticklabels()[0]):
         assert text.get_fontfamily() == ["sans-serif", "own"]
 
@@ -69,5 +69,5 @@ def test_a_figure_in_the_default_font_is_left_as_it_is() -> None:
     """No other font."""
     figure, axes = page.figure()
     axes[0, 0].set_title("gap (m), Δv, θ")
-    fonts.legible(figure)
+    page.legible(figure)
     assert axes[0, 0].title.get_fontfamily() == ["sans-serif"]

@@ -271,11 +271,11 @@ def top_level() -> set[str]:
         (ways_up, 0),
         (classes_named_twice, 7),
         (lines_behind_a_step, 2307),
-        (lines_of_code, 35295),
+        (lines_of_code, 35274),
         (functions_of_many_parameters, 15),
         (high_packages, 1),
         (file_names_twice, 25),
-        (set_by_hand, 158),
+        (set_by_hand, 156),
     ],
     ids=lambda x: getattr(x, "__name__", None),
 )

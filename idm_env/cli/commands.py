@@ -181,7 +181,7 @@ def plot(
         raise ValueError(f"{written[1]} was not written by idm-env plot. Move it, or give --out another name.")
     repairs: tuple[Any, ...] = ()
     with shown(console) as report:
-        from idm_env.reports import diagrams, fonts
+        from idm_env.reports import diagrams
 
         if source.suffix in (".yaml", ".yml"):
             drawings = _rollout_panels(source, seconds, seed, report)
@@ -200,7 +200,7 @@ def plot(
         title = f"{source.name}{more}" if len(largest) > 1 else f"{source.name}: {largest[0].title}{more}"
         out.parent.mkdir(parents=True, exist_ok=True)
         figure = diagrams.figure_of(largest, title)
-        fonts.legible(figure)
+        page.legible(figure)
         storage.write(out, figure.savefig)
         if html:
             diagrams.write_html(out.with_suffix(".html"), largest, title)

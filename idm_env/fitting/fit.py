@@ -1,7 +1,7 @@
 """Calibration: from episodes to fitted parameters with standard errors, interruptible and resumable."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -12,7 +12,6 @@ from torch import Tensor
 
 from idm_env.data import Episode
 from idm_env.effects import IDM, Brakes, CarFollowing, Effect, Replay
-from idm_env.fitting.adam import adam
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.problem import Loss, Objective, Problem, group_of
@@ -20,6 +19,7 @@ from idm_env.fitting.solver import Normal, Progress, minimise, normal
 from idm_env.fitting.uncertainty import Uncertainty, estimate_row, uncertainty
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress
+from idm_env.parameters import constrain, unconstrain
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 from idm_env.validation import one_of
@@ -177,6 +177,66 @@ def _adam(
     now = normal(problem, own[None], shared[None])
     gain = torch.einsum("gp,gpq,gq->g", now.gradient[0], torch.linalg.pinv(now.hessian[0]), now.gradient[0])
     return own, shared, gain <= 0.01 * now.cost[0], steps
+
+
+def adam(
+    problem: Problem,
+    own: Tensor,
+    shared: Tensor,
+    *,
+    steps: int = 500,
+    rate: tuple[float, float] = (0.1, 0.01),
+    state: dict[str, Any] | None = None,
+    on_step: Callable[[int, float, dict[str, Any]], None] | None = None,
+) -> tuple[Tensor, Tensor, float]:
+    """Minimise the mean squared residual; return own [G, P] and shared [Q] values and the last loss.
+
+    Every parameter lives on the real line behind ``biject_to`` of its bounds; the learning rate falls linearly from
+    ``rate[0]`` to ``rate[1]``. ``state`` is what ``on_step`` was given last: with it an interrupted run goes on as
+    if nothing had happened.
+    """
+    free = [
+        unconstrain(p, own[:, i]) if i < len(problem.own) else unconstrain(p, shared[i - len(problem.own)])
+        for i, p in enumerate(problem.parameters)
+    ]
+    leaves = [x.clone().requires_grad_() for x in free]
+    optimiser = torch.optim.Adam(leaves, lr=rate[0])
+    schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, rate[1] / rate[0], total_iters=steps)
+    begin = 0
+    if state is not None:
+        with torch.no_grad():
+            for leaf, saved in zip(leaves, state["leaves"], strict=True):
+                leaf.copy_(saved)
+        optimiser.load_state_dict(state["optimiser"])
+        schedule.load_state_dict(state["schedule"])
+        begin = state["step"]
+
+    def values() -> tuple[Tensor, Tensor]:
+        inside = [constrain(p, x) for p, x in zip(problem.parameters, leaves, strict=True)]
+        cut = len(problem.own)
+        own_now = torch.stack(inside[:cut], dim=-1)
+        return own_now, torch.stack(inside[cut:]) if inside[cut:] else shared
+
+    loss_value = float("nan")
+    count = problem.weight.sum() * (2 if problem.objective == "both" else 1)
+    for step in range(begin, steps):
+        optimiser.zero_grad()
+        residual = problem.residual(problem.simulate(problem.rows(*values())))
+        loss = residual.square().sum() / count
+        loss_value = float(loss.detach())
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        schedule.step()
+        if on_step is not None:
+            saved = {
+                "leaves": [x.detach().clone() for x in leaves],
+                "optimiser": optimiser.state_dict(),
+                "schedule": schedule.state_dict(),
+                "step": step + 1,
+            }
+            on_step(step + 1, loss_value, saved)
+    own_end, shared_end = values()
+    return own_end.detach(), shared_end.detach(), loss_value
 
 
 def _levenberg(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from idm_env.extras import needed
-from idm_env.reports.fonts import legible
+from idm_env.reports import page
 
 COLOURS = np.array([(178, 24, 43), (239, 138, 98), (253, 219, 120), (120, 190, 110), (26, 120, 80)], float)
 """Red at standstill, over yellow, to green at full speed; RGB in 0–255."""
@@ -177,7 +177,7 @@ def space_time(
     """
     pictures = panels_of(data, dt=dt, row=row, ring_length=ring_length, marked=marked)
     figure = figure_of(pictures[:most], title, fastest)
-    legible(figure)
+    page.legible(figure)
     return figure
 
 
@@ -231,8 +231,6 @@ def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = N
 
 def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
     """Write an interactive page: choose a panel, look closer, point at a vehicle. It needs nothing from elsewhere."""
-    from idm_env.reports import page
-
     stride, fastest = _stride(drawn, MOST_POINTS), _fastest(drawn)
     content = {
         "colours": COLOURS.tolist(),

@@ -116,11 +116,33 @@ def picture(figure: Figure, caption: str, narrow: Figure | None = None) -> Block
 
     ``narrow`` is shown instead where the screen is less than 600 pixels wide.
     """
-    from idm_env.reports.fonts import legible
-
     for each in (figure, narrow) if narrow is not None else (figure,):
         legible(each)
     return Block("figure", caption, _encoded(figure), narrow="" if narrow is None else _encoded(narrow))
+
+
+def legible(figure: Figure) -> None:
+    """Let texts of a figure fall back to installed fonts with glyphs that the default font lacks; to be called last."""
+    from matplotlib import rcParams
+    from matplotlib.font_manager import FontProperties, findfont, fontManager, get_font
+    from matplotlib.text import Text
+
+    ticks = [label for panel in figure.axes for axis in (panel.xaxis, panel.yaxis) for label in axis.get_ticklabels()]
+    texts = [*ticks, *(text for text in figure.findobj(Text) if isinstance(text, Text))]
+    lacking = {ord(c) for text in texts for c in text.get_text() if not c.isspace()}
+    lacking -= get_font(findfont(FontProperties())).get_charmap().keys()
+    families = list(rcParams["font.family"])
+    for entry in fontManager.ttflist if lacking else ():
+        # Those draw boxes for everything, or bitmaps that matplotlib cannot scale.
+        if not any(word in entry.name.lower() for word in ("last resort", "emoji")):
+            glyphs = get_font(entry.fname).get_charmap().keys()
+            families += [entry.name] * bool(lacking & glyphs)
+            lacking -= glyphs
+    if len(families) > len(rcParams["font.family"]):
+        for text in texts:
+            text.set_fontfamily(families)
+        for panel in figure.axes:
+            panel.tick_params(labelfontfamily=families)
 
 
 def _encoded(figure: Figure) -> str:

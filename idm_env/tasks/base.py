@@ -22,9 +22,8 @@ from idm_env.parameters import catalogue
 from idm_env.roads import Road
 from idm_env.simulator import Simulator, stacked
 from idm_env.tasks.behaviour import Behaviour, behaviour
-from idm_env.tasks.checks import Range, agents_of, in_ranges, limits_of, ranges, ranges_of, two_ends
+from idm_env.tasks.checks import Range, agents_of, in_ranges, limits_of, one_declared, ranges, ranges_of, two_ends
 from idm_env.tasks.crash import contact, lawful_cost
-from idm_env.tasks.declared import one_declared
 from idm_env.tasks.failsafe import safe_accel
 from idm_env.tasks.features import FEATURES, AgentView, Feature, ObservedFeature, chosen
 from idm_env.tasks.random import Draw

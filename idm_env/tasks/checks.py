@@ -5,11 +5,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
 from os import PathLike
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+from idm_env.effects import registry
+from idm_env.jobs import trust
 from idm_env.model_file import nested
 from idm_env.validation import at_least, finite, nearest, shown, whole
 
+T = TypeVar("T")
 _WEAKEST, _STRONGEST = 1e-3, 100.0
 
 
@@ -215,3 +218,26 @@ def agents_of(controlled: Any, vehicles: int, first: int) -> tuple[int, ...]:
             "Control fewer or take more vehicles."
         )
     return tuple(first + i * free // count for i in range(count))
+
+
+def one_declared(entry: object, kind: type[T], known: Mapping[str, T], where: str) -> T:
+    """Resolve an entry: an instance of ``kind``, a name of the catalogue, or ``file.py:name``.
+
+    ValueError, in one line, for an unknown name, and for the place of code that is not trusted or has no such thing.
+    """
+    if isinstance(entry, kind):
+        return entry
+    if not isinstance(entry, str) or ":" not in entry:
+        if isinstance(entry, str) and entry in known:
+            return known[entry]
+        raise ValueError(f"{where}: {shown(entry)} is unknown.{nearest(str(entry), known)}")
+    place = entry.rpartition(":")[0]
+    if registry.module_at(place) is None and not trust.permission():
+        raise ValueError(
+            f"{where}: {shown(entry)} is code of {shown(place)}, which is not run unasked. Read it, then give --trust, "
+            f"trusted=True in Python, or {trust.VARIABLE}=1."
+        )
+    member = registry.member(entry, where)[1]
+    if not isinstance(member, kind):
+        raise ValueError(f"{where}: {shown(entry)} is no {kind.__name__}. Name one that the file declares.")
+    return member

@@ -24,11 +24,11 @@ from idm_env.jobs.executor import Executor, Serial
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.jobs.shards import Parts
 from idm_env.reports.page import account, versions
-from idm_env.trajectories import chunks, left_out, paper, pictures
+from idm_env.trajectories import chunks, left_out, paper
 from idm_env.trajectories.chunks import CHUNK, OURS, PARAMETERS, TRAJECTORIES, FilePlan, FilterSettings, Recipe
 from idm_env.trajectories.noise import fit_noise, is_dense
 from idm_env.trajectories.recipe import Filtered, recipe
-from idm_env.trajectories.report import write_report
+from idm_env.trajectories.report import space_time, write_report
 from idm_env.trajectories.scores import RegularMotion, Tally
 from idm_env.trajectories.smoother import PositionNoise
 from idm_env.trajectories.spool import Reading, Shelf, Spool
@@ -122,7 +122,7 @@ def _run(
     parts.join(TRAJECTORIES, out / "trajectories.parquet")
     parts.join(PARAMETERS, out / "parameters.parquet")
     report = _report(spool, summaries, settings, plan) | {"left_out_points": scored}
-    figures = pictures.space_time(out / "trajectories.parquet", spool, bridge)
+    figures = space_time(out / "trajectories.parquet", spool, bridge)
     parameters = pl.read_parquet(out / "parameters.parquet", glob=False)
     write_report(out, report, _shown(out, spool, bridge), parameters, figures)
     parts.remove()
