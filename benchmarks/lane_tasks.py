@@ -40,12 +40,13 @@ from idm_env.effects.idm import interaction
 from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.types import Driver
 
+JOINT = {"controlled": 0.1, "careful": True, "added": False}
 DEMANDS: dict[str, dict[str, Any]] = {
-    "merge 2400 + 500": {"task": "merge", "inflow": 2400.0, "ramp_inflow": 500.0},
-    "merge 3000 + 800": {"task": "merge"},
-    "bottleneck 1900": {"task": "bottleneck"},
-    "open_highway 5000": {"task": "open_highway"},
-    "approach 1200": {"task": "approach"},
+    "merge 2400 + 500": {**JOINT, "task": "merge", "inflow": 2400.0, "ramp_inflow": 500.0},
+    "merge 3000 + 800": {**JOINT, "task": "merge"},
+    "bottleneck 1900": {**JOINT, "task": "bottleneck"},
+    "open_highway 5000": {**JOINT, "task": "open_highway"},
+    "approach 1200": {**JOINT, "task": "approach", "controlled": 1.0 / 3.0},
 }
 DRAWS, JUDGED_ON = 24, 32
 CONSTANT = (-1.0, -0.5, 0.0, 0.1, 0.25, 0.5, 1.0)

@@ -495,9 +495,9 @@ class Stood(NamedTuple):
 WITHOUT = {"gap_acceptance": "strength", "courtesy": "weight", "mandatory_change": "turns", "calm": "coolness"}
 BEFORE: tuple[dict[str, Any], ...] = ({effect: {name: 0.0} for effect, name in WITHOUT.items()}, {})
 DEMANDS = {
-    "merge 2400 + 500": (MergeTask, {"inflow": 2400.0, "ramp_inflow": 500.0}),
-    "merge 3000 + 800": (MergeTask, {"inflow": 3000.0, "ramp_inflow": 800.0}),
-    "bottleneck 1900": (BottleneckTask, {"inflow": 1900.0}),
+    "merge 2400 + 500": (MergeTask, {"controlled": 0.1, "inflow": 2400.0, "ramp_inflow": 500.0}),
+    "merge 3000 + 800": (MergeTask, {"controlled": 0.1, "inflow": 3000.0, "ramp_inflow": 800.0}),
+    "bottleneck 1900": (BottleneckTask, {"controlled": 0.1, "inflow": 1900.0}),
 }
 
 

@@ -5,7 +5,8 @@ there is none where nobody does better than human drivers. Rows, all on the same
 keywords of ``GIVEN``:
 
 * *random*, *zero*, and the *constant* that is best of 13 accelerations on other episodes;
-* *rule*: IDM's formula as commands, its six numbers the best of a cross-entropy search that sees only returns;
+* *rule*: IDM's formula as commands, where they are added less a human's, its six numbers the best of a cross-entropy
+  search that sees only returns;
 * *PPO*: Stable-Baselines3's, ten lines as in README, its steps chosen by task, several seeds, each its last policy;
 * *APG*, on one lane: gradients through 60 decisions of 32 environments, 200 times, each seed's last policy;
 * *oracle*: that rule with the six numbers that are best in each of these episodes, found on it: what foresight
@@ -66,6 +67,7 @@ SEEN = {"features": ["speed", "lead_speed", "gap"], "scaling": "raw"}
 GENERATIONS, RULES = 8, 16
 RANGES = ((2.5, 40.0), (0.1, 3.0), (0.3, 6.0), (0.3, 3.0), (0.5, 4.0), (0.005, 1.0))
 """Where rules are looked for: v0 (m/s), T (s), s0 (m), a, b (m/s²), and the share of IDM's acceleration."""
+IDM = ("desired_speed", "time_gap", "min_gap", "max_accel", "comfort_decel")
 
 IDLE, LEARNT = ("random", "zero", "constant"), ("PPO", "APG")
 """Rows of what learns nothing, and those that have seeds."""
@@ -114,13 +116,18 @@ def random(task: str) -> Act:
 
 def rule(task: str, values: np.ndarray) -> Act:
     """Return actions of IDM's formula, a row of ``values`` for each environment or one for all, times a share."""
-    v0, headway, s0, a, b, share = np.atleast_2d(values)[:, None].transpose(2, 0, 1)
-    low, high = gymnasium.make("DiffIDM-v0", task=task).unwrapped.task.command_limits  # type: ignore[attr-defined]
+    *numbers, share = np.atleast_2d(values)[:, None].transpose(2, 0, 1)
+    env: Any = gymnasium.make("DiffIDM-v0", task=task).unwrapped
+    low, high = env.task.command_limits
+    human = [env.task.own_parameters["idm"][name] for name in IDM] if task in OPEN else None
 
-    def act(seen: np.ndarray) -> np.ndarray:
+    def accel_of(seen: np.ndarray, v0: Any, headway: Any, s0: Any, a: Any, b: Any) -> np.ndarray:
         speed, lead, gap = np.moveaxis(seen.reshape(len(seen), -1, 3), -1, 0)
         wish = s0 + (speed * headway + speed * (speed - lead) / (2.0 * np.sqrt(a * b))).clip(0.0)
-        accel = share * a * (1.0 - (speed / v0) ** 4 - (wish / gap.clip(0.5)) ** 2)
+        return np.asarray(a * (1.0 - (speed / v0) ** 4 - (wish / gap.clip(0.5)) ** 2))
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        accel = share * (accel_of(seen, *numbers) - (0.0 if human is None else accel_of(seen, *human)))
         return np.asarray(np.where(accel < 0.0, accel / -low, accel / high).clip(-1.0, 1.0), np.float32)
 
     return act

@@ -11,6 +11,9 @@ import numpy as np
 
 ROAD = {
     "task": "approach",
+    "controlled": 1 / 3,
+    "careful": True,
+    "added": False,
     "lanes_count": 1,
     "inflow": 600.0,
     "vehicles": 60,

@@ -75,8 +75,9 @@ LINKS: tuple[str, ...] = LaneState._fields[:7]
 class Trips(NamedTuple):
     """When every slot's vehicle wants to drive, and how often it has: tensors that broadcast to ``(..., vehicles)``.
 
-    ``departs`` is when the first trip is due (s), ``again`` after how long the next one is (s; infinity for never),
-    ``lane`` where it enters, ``speed`` at which, if there is room (m/s). ``entered`` and ``left`` count what was done.
+    ``departs`` is when the first trip is due (s), ``again`` after how long the next one is (s; infinity for never, 0
+    for as soon as it has left), ``lane`` where it enters, ``speed`` at which, if there is room (m/s). ``entered`` and
+    ``left`` count what was done.
     """
 
     departs: Tensor

@@ -104,8 +104,9 @@ def _begins(road: Road, like: Tensor) -> Tensor:
 
 def due(schedule: Trips, time: Tensor) -> Tensor:
     """Return how many trips of every slot should have begun by a time (s)."""
-    more = torch.where(schedule.again.isinf(), 0.0, (time - schedule.departs) / schedule.again).floor().clamp_min(0.0)
-    return torch.where(time >= schedule.departs, 1 + more.long(), 0)
+    more = (time - schedule.departs) / schedule.again.clamp_min(1e-3)
+    more = torch.where(schedule.again.isinf(), 0.0, more).floor().clamp_min(0.0).long()
+    return torch.where(time >= schedule.departs, 1 + torch.where(schedule.again > 0.0, more, schedule.left), 0)
 
 
 def counts(stepping: CarFollowingStep, state: State) -> Counts:

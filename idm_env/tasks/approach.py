@@ -41,9 +41,19 @@ def _signal(view: AgentView) -> tuple[Tensor, Tensor]:
     return view.own(red.to(since.dtype)), view.own(until)
 
 
+def _pace(step: Transition) -> Tensor:
+    """Return ``min(v/v0, 1)``, the agent's own."""
+    return step.view.own((step.after.state.speed / step.after.episode["free_speed"]).clamp_max(1.0))
+
+
+def _economy(step: Transition) -> Tensor:
+    """Return ``1 − F/F_max``, F the agent's own fuel rate, F_max = 4 mL/s."""
+    return 1.0 - step.view.own(fuel(step.after.state.speed, step.after.state.accel)) / 4.0
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ApproachTask(OpenLanesTask):
-    """A demonstration: the last 500 m before a signal with a fixed cycle, where a third of the vehicles are agents.
+    """A demonstration: the last 500 m before a signal with a fixed cycle, driven again and again.
 
     Vehicles come in platoons, as from a signal upstream with the same cycle. Episodes begin at any phase of it. Who is
     first in a queue starts 1 s late. A queue of 20 leaves at 1860 vehicles an hour and lane with 2.1 s of start-up lost
@@ -52,9 +62,9 @@ class ApproachTask(OpenLanesTask):
     other open tasks.
 
     Observation: as there; before the nearest vehicles the way to the signal (m), 1 if it is red, and the time to its
-    next change (s). Reward, the same for all agents: ``0.5 Σ min(v/v0, 1)/(n + queued) + 0.5/(1 + F/F_0)``, F the mean
-    fuel rate on the road (Kamal's), F_0 = 1 mL/s. ``reward="delay"``: minus the delay of all in this step, and minus
-    what all burn (mL) times ``fuel_weight``: ``−t (Σ (1 − min(v/v0, 1)) + queued + w Σ F)``.
+    next change (s). Reward, per agent: ``0.5 min(v/v0, 1) + 0.5 (1 − F/F_max)``, F its fuel rate (Kamal's), F_max = 4
+    mL/s. ``reward="delay"``: minus the delay of all in this step, and minus what all burn (mL) times ``fuel_weight``:
+    ``−t (Σ (1 − min(v/v0, 1)) + queued + w Σ F)``.
 
     Args:
         lanes_count: Number of lanes, from 1 to 3.
@@ -74,7 +84,6 @@ class ApproachTask(OpenLanesTask):
         "fuel_weight": Range(0.0, 1e3, "vehicle-seconds"),
     }
 
-    controlled: int | float | str | tuple[int, ...] = 1.0 / 3.0  # type: ignore[assignment]
     entry_speed: float = 14.0
     lanes_count: int = 2
     inflow: float = 1200.0
@@ -142,10 +151,8 @@ class ApproachTask(OpenLanesTask):
         """As in the other open tasks, with what the signal does in these episodes."""
         world = super().begin(draw, params)
         speed = world.state.speed
-        signal = {
-            f"signal_{name}": params["signal"][name].detach().to(speed.dtype).expand_as(speed).contiguous()
-            for name in _SAID
-        }
+        own = {f"signal_{name}": params["signal"][name].detach().to(speed.dtype) for name in _SAID}
+        signal = {name: x.expand_as(speed).contiguous() for name, x in own.items()}
         return world._replace(episode={**world.episode, **signal})
 
     @property
@@ -160,18 +167,15 @@ class ApproachTask(OpenLanesTask):
 
     @property
     def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
-        """``unit``; and minus delay and fuel."""
-        most = self._most * (1.0 + self.fuel_weight * _MOST_FUEL)
-        economy = RewardTerm("economy", "1/(1 + F/F_0)", "", 0.0, 1.0, self._economy, shared=True)
-        delay = RewardTerm("delay", "Σ (1 − min(v/v0, 1)) + queued + w Σ F", "vehicles", 0.0, most, self._delay, True)
-        (pace,) = super().own_rewards["unit"]
-        return {"unit": {pace: 0.5, economy: 0.5}, "delay": {delay: -self.step_time}}
+        """As in the other open tasks; ``unit`` and ``delay`` are of fuel, too."""
+        pace = RewardTerm("pace", "min(v/v0, 1)", "", 0.0, 1.0, _pace)
+        economy = RewardTerm("economy", "1 − F/F_max", "", 0.0, 1.0, _economy)
+        return {**super().own_rewards, "unit": {pace: 0.5, economy: 0.5}}
 
-    def _economy(self, step: Transition) -> Tensor:
-        """Return ``1/(1 + F/F_0)``, F the mean fuel rate of all on the road, F_0 = 1 mL/s."""
-        state = step.after.state
-        assert state.present is not None
-        return 1.0 / (1.0 + (self.burnt(state) / state.present.sum(-1).clamp_min(1.0)).unsqueeze(-1))
+    @property
+    def _most(self) -> float:  # type: ignore[override]
+        """As in the other open tasks, with fuel."""
+        return super()._most * (1.0 + self.fuel_weight * _MOST_FUEL)
 
     def burnt(self, state: State) -> Tensor:
         """Return what all on the road burn (mL/s)."""

@@ -13,9 +13,9 @@ from idm_env.roads import Lanes
 from idm_env.tasks.base import EnvState
 from idm_env.tasks.checks import Range
 from idm_env.tasks.features import FEATURES, Feature
-from idm_env.tasks.lanes import FASTEST, LanesTask
+from idm_env.tasks.lanes import PACE, LanesTask
 from idm_env.tasks.random import Draw
-from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition
+from idm_env.tasks.reward_terms import RewardTerm
 from idm_env.types import Params
 
 _PLACE_STREAM = 31
@@ -97,12 +97,4 @@ class HighwayTask(LanesTask):
     @property
     def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
         """``unit``."""
-        return {"unit": {PACE: 0.9, REWARD_TERMS["ease"]: 0.1}}
-
-
-def pace(step: Transition) -> Tensor:
-    """Return ``min(v, 40 m/s)/40 m/s``, ``(…, agents)``."""
-    return step.task.pick(step.after.state.speed).clamp_max(FASTEST) / FASTEST
-
-
-PACE = RewardTerm("pace", "min(v, 40 m/s)/40 m/s", "", 0.0, 1.0, pace)
+        return {"unit": PACE}

@@ -15,6 +15,7 @@ from idm_env.tasks.base import EnvState, Task
 from idm_env.tasks.checks import Range
 from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.random import Draw
+from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition
 from idm_env.types import Inputs, Params, State
 
 FASTEST = 40.0
@@ -214,3 +215,12 @@ def _nearby(what: int, k: int, view: AgentView) -> Tensor:
 def _nearest(view: AgentView) -> tuple[Tensor, ...]:
     assert isinstance(view.task, LanesTask)
     return view.task.nearest(view.state)
+
+
+def pace(step: Transition) -> Tensor:
+    """Return ``min(v, 40 m/s)/40 m/s``, ``(…, agents)``."""
+    return step.task.pick(step.after.state.speed).clamp_max(FASTEST) / FASTEST
+
+
+PACE = {RewardTerm("pace", "min(v, 40 m/s)/40 m/s", "", 0.0, 1.0, pace): 0.9, REWARD_TERMS["ease"]: 0.1}
+"""The reward of an agent among others on several lanes."""

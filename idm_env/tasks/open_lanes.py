@@ -18,11 +18,11 @@ from idm_env.multilane import demand
 from idm_env.roads import Lanes
 from idm_env.tasks.base import EnvState
 from idm_env.tasks.checks import FLOW, Range, entry
-from idm_env.tasks.features import AgentView, Feature, feature, part
-from idm_env.tasks.lanes import LanesTask
+from idm_env.tasks.features import FEATURES, AgentView, Feature, feature, part
+from idm_env.tasks.lanes import FASTEST, PACE, LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import RewardTerm, Transition
-from idm_env.tasks.said_roads import STANDS, DriverClass, Loop, classes_of, lengths, loops_of, rules_of, with_classes
+from idm_env.tasks.said_roads import STANDS, DriverClass, Loop, classes_of, loops_of, rules_of, with_classes
 from idm_env.tasks.starting_places import with_room
 from idm_env.tasks.trip_table import KEYS, TripTable, read, spread, table as made
 from idm_env.types import ENTRY_SPEED, Params, State, Trips
@@ -69,28 +69,32 @@ class OpenLanesTask(LanesTask):
     again in that order, so arrivals repeat after ``vehicles / inflow``. An episode begins with free traffic up to
     ``filled``. Whoever finds no room there, or at his entry, waits and is counted (``multilane.demand.counts``).
 
-    An agent is the vehicle of a slot: it appears when its trip begins and ends with it. With PettingZoo every trip is
-    an agent of its own; the joint face tells by ``info["present"]`` who is there. Commands are accelerations, held for
-    1 s; with ``careful`` they count only as far as the driver himself would go, and no command makes a crash. While an
-    agent's vehicle waits or has left, its observation and infos are zeros, and its command does nothing.
+    One vehicle is the agent (``controlled=1``): it is on the road when an episode begins, and enters again as soon as
+    it has left, where there is an on-ramp always there. Its commands are accelerations, held for 1 s, and are added to
+    what its driver would do: zeros are human driving.
+    ``controlled=0.1, careful=True, added=False, reward="traffic"`` is the joint form: agents are the vehicles of slots,
+    and a command counts only as far as the driver himself would go, so that none makes a crash. The joint face tells by
+    ``info["present"]`` who is there; with PettingZoo every trip is an agent of its own. While an agent's vehicle waits
+    or has left, its observation and infos are zeros, and its command does nothing.
 
     Drivers let in whoever signals, accept closer gaps near the end of a lane and where they have stood
     (``GapAcceptance``), stay calm where somebody cuts in (``Calm``), and take turns at an end as at a zipper
     (``Courtesy``, ``MandatoryChange``).
 
-    Observation, per agent: own speed, lane, 1 if it is on the road, how far its lane goes on (m, at most 500), its
-    place (m), how far it is to the next end of any lane (m, at most 500) and how many lanes to the left that is; then
-    the nearest vehicles as in ``highway``.
-    Reward, the same for all agents: ``Σ min(v/v0, 1)/(n + queued)``, the mean of speeds over desired ones, of all on
-    the road and, as 0, of those who wait. ``reward="delay"``: minus the delay of all in this step (vehicle-seconds),
-    ``−t (Σ (1 − min(v/v0, 1)) + queued)``, so that its sum is the total delay against free travel at every driver's
-    v0. Terminated where vehicles touch, or an agent drives over the end of a lane. Cut off after 600 s.
+    Observation, per agent: own speed, lane, the leader's relative speed and gap, 1 if it is on the road, how far its
+    lane goes on (m, at most 500), its place (m), how far it is to the next end of any lane (m, at most 500) and how
+    many lanes to the left that is; then the nearest vehicles as in ``highway``.
+    Reward, per agent: as in ``highway``, ``0.9 v/40 + 0.1 (1 − (u/u_max)²)``, 0 while it is away. The same for all
+    agents is ``reward="traffic"``: ``Σ min(v/v0, 1)/(n + queued)``, the mean of speeds over desired ones, of all on the
+    road and, as 0, of those who wait. ``reward="delay"``: minus the delay of all in this step (vehicle-seconds), ``−t
+    (Σ (1 − min(v/v0, 1)) + queued)``, so that its sum is the total delay against free travel at every driver's v0.
+    Terminated where vehicles touch, or an agent drives over the end of a lane. Cut off after 600 s.
 
     Args:
         entry_speed: Speed at which vehicles ask to enter (m/s).
         careful: Whether a command counts only as far as the driver himself would go: ``min(command, driver)``.
         added: Whether commands are added to what the driver would do: zeros are then human driving, and a new policy
-            is a driver. With ``careful`` only those below 0 count; without a ``failsafe``, which judges whole commands.
+            is a driver. With ``careful`` only those below 0 count. None: unless a ``failsafe`` judges whole commands.
         classes: Drivers who are not as all others: ``{"truck": {"share": 0.2, "length": 12.0, "parameters":
             {"idm.desired_speed": 24.0}}}``, shares of those who enter, length in metres.
         trips: Who departs when, in place of the inflow: a table, rows or a CSV file with the columns of
@@ -117,16 +121,18 @@ class OpenLanesTask(LanesTask):
     usual_hold: ClassVar[float | None] = 1.0
     can_draw: ClassVar[tuple[str, ...]] = ("inflow",)
     begins_with: ClassVar[tuple[str, ...]] = ("inflow",)
+    most_filled: ClassVar[float] = 300.0
     ramp: ClassVar[int | None] = None
     """The lane whose demand is ``ramp_inflow``."""
     ranges: ClassVar[Mapping[str, Range]] = {"entry_speed": Range(1.0, 70.0, "m/s"), "inflow": FLOW}
 
     vehicles: int = 120
-    controlled: int | float | str | Sequence[int] = 0.1
+    controlled: int | float | str | Sequence[int] = 1
+    seen: int = 3
     max_command: float | Sequence[float] = 2.0
     entry_speed: float = ENTRY_SPEED
-    careful: bool = True
-    added: bool = False
+    careful: bool = False
+    added: bool | None = None
     classes: Mapping[str, Any] | None = None
     trips: Any = None
     limits: Sequence[Mapping[str, Any]] = ()
@@ -136,6 +142,8 @@ class OpenLanesTask(LanesTask):
     def __post_init__(self) -> None:
         if self.table is not None:
             object.__setattr__(self, "vehicles", len(self.table.depart))
+        if self.added is None:
+            object.__setattr__(self, "added", not self.failsafe)
         super().__post_init__()
         _ = self.loops, self.kinds
         if self.added and self.failsafe:
@@ -174,7 +182,7 @@ class OpenLanesTask(LanesTask):
     @property
     def filled(self) -> float:
         """Up to where vehicles are when an episode begins (m)."""
-        return 300.0
+        return min(self.most_filled, 0.5 * (self.road.length or 0.0))
 
     def _check_table(self, table: TripTable) -> None:
         """Raise ValueError for trips of this task that nobody could make."""
@@ -202,6 +210,11 @@ class OpenLanesTask(LanesTask):
         if isinstance(self.trips, Mapping) and "per_hour" in self.trips:
             return read(made(**entry("trips", self.trips, KEYS)))
         return read(self.trips)
+
+    @property
+    def ego(self) -> bool:
+        """Whether the only agent is one that enters again as soon as it has left: ``controlled=1``."""
+        return self.table is None and self.controlled == 1 and isinstance(self.controlled, int)
 
     @property
     def exits(self) -> Mapping[str, float]:
@@ -252,11 +265,8 @@ class OpenLanesTask(LanesTask):
     def as_driver(self) -> float:
         """A careful command of the driver's own maximum, which never holds him back; 0 where it is added to his."""
         most = self.params(torch.float64, "cpu")[self.simulator.base.name].get("max_accel")
-        return (
-            min(1.0, float(most.max()) / self.command_limits[1])
-            if self.careful and not self.added and most is not None
-            else 0.0
-        )
+        is_whole = self.careful and not self.added
+        return min(1.0, float(most.max()) / self.command_limits[1]) if is_whole and most is not None else 0.0
 
     @property
     def usual_steps(self) -> int:
@@ -266,7 +276,7 @@ class OpenLanesTask(LanesTask):
     @property
     def machinery(self) -> tuple[laws.Effect, ...]:  # type: ignore[override]
         """Effects through which agents act."""
-        return (laws.Control(careful=self.careful, added=self.added), *super().machinery[1:], *self.rules)
+        return (laws.Control(careful=self.careful, added=bool(self.added)), *super().machinery[1:], *self.rules)
 
     @cached_property
     def _slots(self) -> tuple[tuple[float, float], ...]:
@@ -311,9 +321,11 @@ class OpenLanesTask(LanesTask):
             again[:, mine] = cycles
         order = departs.argsort(dim=-1, stable=True)
         none = torch.zeros(shape, dtype=torch.int64, device=device)
+        again, lane = again.gather(-1, order), lane.long().expand(shape).gather(-1, order)
+        if self.ego:
+            again[:, 0], lane[:, 0] = 0.0, lane[:, 0] if self.ramp is None else self.ramp
         return Trips(
-            (departs.gather(-1, order) - self.filled / self.entry_speed).to(dtype), again.gather(-1, order).to(dtype),
-            lane.long().expand(shape).gather(-1, order),
+            (departs.gather(-1, order) - self.filled / self.entry_speed).to(dtype), again.to(dtype), lane,
             torch.full(shape, self.entry_speed, dtype=dtype, device=device), none, none.clone(),
         )  # fmt: skip
 
@@ -350,7 +362,7 @@ class OpenLanesTask(LanesTask):
         return ends
 
     def _lengths(self) -> list[float]:
-        return lengths(self.kinds, self._classes, self.vehicle_length)
+        return [self._classes[kind].length if kind else self.vehicle_length for kind in self.kinds]
 
     @property
     def features_of_self(self) -> tuple[Feature, ...]:
@@ -358,6 +370,8 @@ class OpenLanesTask(LanesTask):
         last = float(max(self.road.count - 1, 1))
         return (
             *super().features_of_self,
+            feature("relative_speed", 10.0, -FASTEST, FASTEST),
+            FEATURES["gap"],
             Feature("present", "", "", 1.0, 0.0, 1.0, _present),
             Feature("ends", "", "m", 100.0, 0.0, _SIGHT, _ends),
             feature("position", 100.0, 0.0, 1e6),
@@ -395,6 +409,7 @@ class OpenLanesTask(LanesTask):
         if self.table is not None:
             return 1
         cycle = min(sum(mean for k, mean in self._slots if k == lane) for lane in self.inflows) / self._busiest
+        cycle = (self.road.length or 0.0) / 100.0 if self.ego else cycle  # nobody drives faster than 100 m/s
         return 2 + math.ceil((self.steps * self.simulator.dt + self.filled / self.entry_speed) / cycle)
 
     @cached_property
@@ -407,12 +422,12 @@ class OpenLanesTask(LanesTask):
 
     @property
     def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
-        """``unit``, and minus the delay."""
-        pace = RewardTerm("pace", "Σ min(v/v0, 1)/(n + queued)", "", 0.0, 1.0, self._pace, shared=True)
+        """``unit`` is the agent's own, ``traffic`` and ``delay`` are all traffic's."""
+        traffic = RewardTerm("traffic", "Σ min(v/v0, 1)/(n + queued)", "", 0.0, 1.0, self._traffic, shared=True)
         delay = RewardTerm("delay", "Σ (1 − min(v/v0, 1)) + queued", "vehicles", 0.0, self._most, self._delay, True)
-        return {"unit": {pace: 1.0}, "delay": {delay: -self.step_time}}
+        return {"unit": PACE, "traffic": {traffic: 1.0}, "delay": {delay: -self.step_time}}
 
-    def _pace(self, step: Transition) -> Tensor:
+    def _traffic(self, step: Transition) -> Tensor:
         """Return ``Σ min(v/v0, 1)/(n + queued)``: the mean of speeds over desired ones, 0 in a queue."""
         state = step.after.state
         assert state.present is not None

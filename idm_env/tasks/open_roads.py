@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,6 +36,7 @@ class OpenHighwayTask(OpenLanesTask):
     """
 
     name: ClassVar[str] = "open_highway"
+    most_filled: ClassVar[float] = math.inf
 
     ranges: ClassVar[Mapping[str, Range]] = {
         "lanes_count": Range(2, 100, whole=True),
@@ -124,11 +126,6 @@ class OpenHighwayTask(OpenLanesTask):
         own = dict.fromkeys(range(first, self.road.count), self.inflow / self.lanes_count)
         return {0: self.ramp_inflow, **own} if self._ramps[0] else own
 
-    @property
-    def filled(self) -> float:
-        """Half of the road."""
-        return 0.5 * self.length
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MergeTask(OpenHighwayTask):
@@ -138,17 +135,13 @@ class MergeTask(OpenHighwayTask):
     """
 
     name: ClassVar[str] = "merge"
+    most_filled: ClassVar[float] = 350.0
 
     lanes_count: int = 2
     length: float = 900.0
     inflow: float = 3000.0
     on_ramp: Sequence[float] | None = (400.0, 600.0)
     ramp_inflow: float = 800.0
-
-    @property
-    def filled(self) -> float:
-        """Up to where vehicles are when an episode begins (m)."""
-        return min(350.0, 0.5 * self.length)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

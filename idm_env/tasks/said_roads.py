@@ -131,11 +131,6 @@ def _leaves_a_way(closed: Sequence[tuple[float, ...]], road: Lanes, time: float)
             raise ValueError(f"closures: nobody gets past {place:g} m at {max(time, 0.0):g} s. Leave a way on.")
 
 
-def lengths(kinds: Sequence[str], classes: Mapping[str, DriverClass], usual: float) -> list[float]:
-    """Return the length (m) of every slot's vehicle."""
-    return [classes[kind].length if kind else usual for kind in kinds]
-
-
 def with_classes(
     values: dict[str, dict[str, Tensor]], kinds: Sequence[str], classes: Mapping[str, DriverClass],
     factors: Mapping[tuple[str, str], Tensor],

@@ -35,7 +35,7 @@ def test_in_free_traffic_what_comes_goes(short):
 def test_the_return_that_is_judged_is_the_environments(monkeypatch, more):
     """A rollout between two decisions pays what the steps of an environment pay, human drivers or agents."""
     monkeypatch.setattr(evaluate, "STEPS_OF_LANES", 150)
-    chosen = {"task": "merge", "vehicles": 30, "reward": "delay", **more}
+    chosen = {"task": "merge", "vehicles": 30, "controlled": 3, "reward": "delay", **more}
     commands = -torch.ones(2, 6 if "lane_commands" in more else 3)
     for act in (None, lambda seen: commands):
         found = evaluate.evaluate_lanes(act, chosen, 2)
@@ -153,7 +153,7 @@ def test_ppo_learns_one_policy_for_all_agents_of_an_environment(quick, monkeypat
 def test_a_new_policy_does_as_the_driver_where_a_task_has_such_an_action(monkeypatch, squash):
     """Training begins at humans: the same return in the same episodes."""
     monkeypatch.setattr(evaluate, "STEPS_OF_LANES", 600)
-    chosen = {"task": "merge", "vehicles": 30}
+    chosen = {"task": "merge", "vehicles": 30, "controlled": 0.1, "careful": True, "added": False}
     task = task_of(chosen)
     policy = Policy(len(task.bounds.names), squash=squash)
     policy.starts_with(task.as_driver)

@@ -36,7 +36,7 @@ def test_whoever_is_due_is_inside_left_or_queued_for_a_minute(name: str) -> None
             assert not task.crashed(world).any()
             seen, there = task.observe(world), task.pick(world.state.present)
             assert (seen[there <= 0] == 0).all()
-            assert torch.equal(seen[..., 2], there)
+            assert torch.equal(seen[..., task.bounds.names.index("present")], there)
     assert (found.left > 5).all()
 
 
@@ -71,7 +71,7 @@ def test_infos_tell_an_inflow_beyond_capacity() -> None:
 
 RECKLESS = {
     "task": "bottleneck", "inflow": 400.0, "vehicles": 8, "controlled": [0], "max_command": 3.0,
-    "lane_commands": True, "careful": False, "hold": 0.1,
+    "lane_commands": True, "added": False, "hold": 0.1,
 }  # fmt: skip
 
 
@@ -150,9 +150,33 @@ def test_behind_a_failsafe_nobody_crashes_whatever_agents_command(name: str, eff
 
 
 @pytest.mark.parametrize("name", OPEN)
+def test_the_first_form_is_one_ego_that_enters_again(name: str) -> None:
+    """One action, about 20 numbers, zeros are human driving, and it is away for less than a tenth of the time."""
+    given = {"task": name, "max_episode_steps": 150, "observation": "raw"}
+    human, zero = (gym.make("DiffIDM-v0", **given) for _ in range(2))
+    assert zero.action_space.shape == (1,) and 20 <= zero.observation_space.shape[0] <= 25
+    human.reset(seed=1)
+    zero.reset(seed=1)
+    there, places = [], []
+    for _ in range(150):
+        seen, reward, *_, info = zero.step(np.zeros(1, np.float32))
+        other, paid, *_ = human.step(None)
+        np.testing.assert_array_equal(seen, other)
+        assert reward == paid and 0.0 <= reward <= 1.0 and bool(info["present"][0]) == (reward > 0.0)
+        there.append(info["present"][0])
+        places += [seen[zero.unwrapped.task.bounds.names.index("position")]] * int(there[-1])  # type: ignore[attr-defined]
+    trips = zero.unwrapped.state.lanes.trips  # type: ignore[attr-defined]
+    assert np.mean(there) > 0.9 and int(trips.entered[0, 0]) >= 2 and int((np.diff(places) < -300.0).sum()) >= 1
+    assert int(info["queued"][0]) < 10
+    if name == "merge":
+        assert trips.lane[0, 0] == 0
+
+
+@pytest.mark.parametrize("name", OPEN)
 def test_the_sum_of_all_rewards_is_the_total_delay(name: str) -> None:
     """Time in a queue, and of every trip its time less its way over its driver's v0, reckoned from positions."""
-    more = {"reward": "delay", **({"fuel_weight": 0.0} if name == "approach" else {})}
+    more = {"reward": "delay", "controlled": 0.3, "careful": True, "added": False}
+    more |= {"fuel_weight": 0.0} if name == "approach" else {}
     env = gym.make("DiffIDM-v0", task=name, dtype="float64", hold=0.1, max_episode_steps=400, **more)
     env.reset(seed=2)
     task, dt = env.unwrapped.task, 0.1  # type: ignore[attr-defined]

@@ -93,7 +93,7 @@ def test_what_cannot_be_drawn_is_said_in_one_line(randomise: object, message: st
 
 def test_demand_is_drawn_for_every_episode_and_given_at_a_reset() -> None:
     """Within its range, each lane its own; ``reset(options=…)`` holds from then on."""
-    task = make_task("merge", randomise={"inflow": [1500, 3000], "ramp_inflow": [400, 800]})
+    task = make_task("merge", controlled=0.1, randomise={"inflow": [1500, 3000], "ramp_inflow": [400, 800]})
     draw = Draw.of(torch.arange(200), torch.zeros(200, dtype=torch.int64))
     trips = task.begin(draw, task.params(torch.float64, "cpu")).state.lanes.trips
     slots = [(trips.lane == k) & trips.again.isfinite() for k in range(3)]
