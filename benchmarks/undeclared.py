@@ -141,6 +141,21 @@ def generated(job: Job) -> Any:
         synthetic.Platoon = original  # type: ignore[attr-defined]
 
 
+def left_by_noise(job: Job) -> float:
+    """Return what IDM errs in the gap in free simulation (m) on the same drivers, with their noise and no effect.
+
+    No right model leaves less of the set with its effect: it is the floor of ``after``.
+    """
+    from idm_env.discovery import crossed
+    from idm_env.discovery.discover import prepare
+    from idm_env.discovery.model import Hypothesis
+
+    records = prepare(generated(dataclasses.replace(job, kind="none")), "driver")
+    fold = crossed.folds_of(records.runs, (), job.seed)
+    errors = crossed.crossed(records, Hypothesis(), np.zeros((int(fold.max()) + 1, 0)), fold)
+    return errors.summary()["gap_rmse_m"]
+
+
 def measure(job: Job, on_progress: object = None) -> dict[str, Any]:
     """Return what the tool says of one set."""
     from idm_env.discovery import discover
@@ -158,10 +173,20 @@ def measure(job: Job, on_progress: object = None) -> dict[str, Any]:
         "over": [f["where"]["coordinate"] for f in report["found"]],
         "before": before["gap_rmse_m"],
         "after": after["gap_rmse_m"],
+        "noise": left_by_noise(job) if job.kind in KINDS else before["gap_rmse_m"],
         "ahead": before["horizon_rmse_m"],
         "ahead_floor": floor["horizon_rmse_m"],
+        "excluded": [_holds(e) for e in report["excluded"]],
         "cpu_s": time.process_time() - begin,
     }
+
+
+def _holds(excluded: dict[str, Any]) -> bool:
+    """Tell whether the interval of an effect's strength holds its null: where nothing is missing, it must."""
+    from idm_env.effects import make
+
+    null = next(p.null for p in make(excluded["effect"]).parameters if p.name == excluded["parameter"])
+    return bool(excluded["low"] <= (null or 0.0) <= excluded["high"])
 
 
 def over_its_own(row: dict[str, Any]) -> bool:
@@ -182,27 +207,30 @@ def shown(rows: list[dict[str, Any]]) -> str:
     for kind in KINDS:
         for ou in (0.0, 0.1):
             sets = by_kind[kind, ou]
-            own = [r["after"] / r["before"] for r in sets if over_its_own(r)]
+            own = [(r["after"] / r["before"], r["noise"] / r["before"]) for r in sets if over_its_own(r)]
             lines.append([
                 kind, f"{ou:g}", share([r["verdict"] in ("shape", "unexplained") for r in sets]),
-                share([over_its_own(r) for r in sets]) if KINDS[kind] else "no such curve",
-                f"{np.median(own):.2f}" if own else "–", share([bool(r["named"]) for r in sets]),
+                share([over_its_own(r) for r in sets]),
+                "{:.2f} ({:.2f})".format(*np.median(own, axis=0)) if own else "–",
+                share([bool(r["named"]) for r in sets]),
                 share([r["verdict"] == "located" for r in sets]), share([r["verdict"] == "undecided" for r in sets]),
                 share([r["verdict"] == "none" for r in sets]),
                 f"{np.median([r['cpu_s'] for r in sets]):.0f}" if sets else "–",
             ])  # fmt: skip
-    head = ("kind", "OU", "noticed", "over its coordinate", "gap after / before there", "catalogue name", "located",
-            "undecided", "none", "CPU s")  # fmt: skip
+    head = ("kind", "OU", "noticed", "over its coordinate", "gap after / before there (noise alone)", "catalogue name",
+            "located", "undecided", "none", "CPU s")  # fmt: skip
     clean = [
         [
             kind, share([bool(r["found"]) or r["verdict"] in ("shape", "located") for r in sets]),
             share([r["verdict"] == "unexplained" for r in sets]), share([r["verdict"] == "undecided" for r in sets]),
             share([r["verdict"] == "none" and r["ahead"] > 3.0 * r["ahead_floor"] for r in sets]),
+            share([holds for r in sets for holds in r["excluded"]]),
             f"{np.median([r['cpu_s'] for r in sets]):.0f}" if sets else "–",
         ]
         for kind, sets in ((kind, by_kind[kind, ou]) for kind, ou in CLEAN.items())
     ]  # fmt: skip
-    names = ("clean", "found", "unexplained", "undecided", "none over 3 × sensors", "CPU s")
+    names = ("clean", "found", "unexplained", "undecided", "none over 3 × sensors", "strengths excluded rightly",
+             "CPU s")  # fmt: skip
     return f"{table(head, lines)}\n\n{table(names, clean)}"
 
 

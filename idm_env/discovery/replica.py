@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.signal import lfilter
 
-from idm_env.discovery import ladder
+from idm_env.discovery import ladder, tails
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records, Rows, whole, windows
+from idm_env.discovery.ridge import by_group
 from idm_env.discovery.score import held_out, log_gain
 from idm_env.discovery.solve import Population, Problem, Solution, solve
-from idm_env.discovery.tails import concentration
 
 LAGS_S = (0.5, 1.5)
 """Lags at which increments of the speed's error are compared: at these, white noise of sensors is gone."""
@@ -132,7 +132,8 @@ def agreement(
     """Return a model's drivers with their noise, and whether its errors 5 s ahead agree with that noise.
 
     Posterior predictive p-values: ``scene`` of the share of the squared error that a smooth function of the scene takes
-    beside drift, as on the ladder with fewer features; ``tails`` of that in the worst windows (``tails``); ``leading``,
+    beside drift, as on the ladder with fewer features; ``sizes``, of what it tells of their sizes, which even noise
+    leaves alone; ``past``, of what a driver's other errors take; ``tails`` of that in the worst windows; ``leading``,
     of a ``term``, of the share of the whitened squared error that it takes. Every replica has drivers' noise, that of
     sensors (``noise_m``), and drivers fitted to it in windows of 5 s, as those of ``solution`` are to the data.
     """
@@ -141,8 +142,16 @@ def agreement(
     def scene(windowed: Problem, theta: np.ndarray) -> float:
         return ladder.structure(windowed.rows, ahead(windowed, theta, drivers.model), seed, FEATURES).share
 
+    def past(windowed: Problem, theta: np.ndarray) -> float:
+        return ladder.followed(windowed.rows, ahead(windowed, theta, drivers.model)).share
+
+    def sizes(windowed: Problem, theta: np.ndarray) -> float:
+        size = np.abs(ahead(windowed, theta, drivers.model))
+        relative = size / by_group(windowed.rows, size + tails.FLOOR_M) - 1.0
+        return ladder.structure(windowed.rows, relative, seed, FEATURES).share
+
     def tail(windowed: Problem, theta: np.ndarray) -> float:
-        return concentration(windowed.rows, ahead(windowed, theta, drivers.model))
+        return tails.concentration(windowed.rows, ahead(windowed, theta, drivers.model))
 
     def gain(windowed: Problem, theta: np.ndarray) -> float:
         assert term is not None
@@ -152,7 +161,9 @@ def agreement(
         mean = float(log_gain(held_out(windowed, before), held_out(windowed, after)).mean())
         return 1.0 - float(np.exp(-2.0 * mean))
 
-    statistics = {"scene": scene, "tails": tail} | ({} if term is None else {"leading": gain})
+    statistics = {"scene": scene, "tails": tail, "sizes": sizes, "past": past} | (
+        {} if term is None else {"leading": gain}
+    )
     mine = {name: f(problem, solution.theta) for name, f in statistics.items()}
     above, draws = dict.fromkeys(mine, 0), dict.fromkeys(mine, 0)
     for draw in range(1, DRAWS + 1):

@@ -8,6 +8,7 @@ import pytest
 from idm_env.data import episodes, hidden, synthetic
 from idm_env.discovery import judge, replica
 from idm_env.discovery.calibrate import first_prior
+from idm_env.discovery.ladder import FORESEEN
 from idm_env.discovery.model import Hypothesis, curve, simple
 from idm_env.discovery.noise import first_noise
 from idm_env.discovery.records import gather, windows
@@ -40,6 +41,7 @@ def test_noise_of_drivers_is_that_of_the_data_and_what_it_leaves_agrees(ou: floa
     assert np.median(drivers.sigma) == pytest.approx(ou, abs=0.02)
     assert not ou or 2.0 <= drivers.memory_s <= 8.0
     _, told = replica.agreement(problem, found, floor_of(problem), 0)
+    assert told.pop("past").share < FORESEEN
     for one in told.values():
         assert not one.is_refused and one.p_value >= 0.05 and one.replicas >= replica.ENOUGH
 

@@ -27,11 +27,12 @@ def test_errors_somewhere_lie_together_and_it_is_told_where(platoon: Records) ->
     assert worst is not None and worst.where == "while the leader brakes" and worst.share > 0.8
 
 
-def told(p_scene: float, p_tails: float) -> Ladder:
+def told(p_scene: float, p_tails: float, p_sizes: float = 0.5, foreseen: float = 0.1) -> Ladder:
     worst = tails.Worst("after a stop", 0.8, 0.3)
     made = SimpleNamespace(
-        agreement=Agreement(0.01, p_scene, 39), tails=Agreement(0.42, p_tails, 39), worst=worst, unsteady=(0.21, 4.0)
-    )
+        agreement=Agreement(0.01, p_scene, 39), tails=Agreement(0.42, p_tails, 39), worst=worst, unsteady=(0.21, 4.0),
+        sizes=Agreement(0.1, p_sizes, 39), past=Agreement(foreseen, 0.025, 39),
+    )  # fmt: skip
     for name in ("is_somewhere", "agrees"):
         setattr(made, name, getattr(Ladder, name).fget(made))
     return made  # type: ignore[return-value]
@@ -44,6 +45,8 @@ def told(p_scene: float, p_tails: float) -> Ladder:
         (told(0.5, 0.6), Verdict.NONE),
         (told(0.1, 0.6), Verdict.UNDECIDED),  # not refused, and no likeness either
         (told(0.5, 0.1), Verdict.UNDECIDED),
+        (told(0.5, 0.6, 0.1), Verdict.UNDECIDED),  # noise that grows with speed
+        (told(0.5, 0.6, 0.5, 0.5), Verdict.UNDECIDED),  # a time gap that wanders
         (told(0.5, 0.025), Verdict.UNEXPLAINED),
     ],
 )
