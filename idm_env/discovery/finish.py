@@ -122,7 +122,9 @@ def finished(
             noisy, agreements = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
             errors = replica.ahead(everywhere[0], everywhere[1].theta, noisy.model)
             worst, unsteady = tails.worst(everywhere[0].rows, errors), (float(np.median(noisy.sigma)), noisy.memory_s)
-            ladder = replace(ladder, agreement=agreements.pop("scene"), **agreements, worst=worst, unsteady=unsteady)
+            ladder = replace(ladder, agreement=agreements["scene"], tails=agreements["tails"], worst=worst)
+            ladder = replace(ladder, sizes=agreements["sizes"], past=agreements["past"], unsteady=unsteady)
+            ladder = replace(ladder, leading=agreements.get("leading"))
         judgement = replace(judgement, ladder=ladder)
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
     limits = ceilings.ceilings_of(decided.null_in_closed_loop, scored, null, decided.rounds[0].smooth_gain)

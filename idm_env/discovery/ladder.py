@@ -38,7 +38,7 @@ The scene tells a part of drivers' noise, too: of six sets without an effect, no
 """
 
 FORESEEN = 0.2
-"""In generated sets other errors foresee 0.10 to 0.13 under noise of 0.1 and 0.2 m/s², 0.5 where T wanders."""
+"""Share foreseen by other errors: 0.10 to 0.13 in generated sets with noise of 0.1 and 0.2 m/s², 0.5 if T wanders."""
 TAILS, ALIKE = 0.03, 0.2
 """p-value below which errors lie together (one of 39 replicas is not), and from which on noise looks like them."""
 
@@ -133,8 +133,7 @@ class Ladder:
     def agrees(self) -> bool:
         """Whether noise of drivers looks like the errors in every test, and not only unlike them in none.
 
-        It does not where a driver's other errors foresee more than ``FORESEEN`` of them, beyond what noise makes: what
-        lasts so long is no noise of this kind. Less comes of a memory that is not known exactly.
+        Other errors of a driver may foresee up to ``FORESEEN``: the noise's memory is not known exactly.
         """
         tests = (self.agreement, self.tails, self.sizes, self.past)
         return all(

@@ -8,7 +8,7 @@ so that thousands of places cost one rollout of 21 copies.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import torch
@@ -255,32 +255,26 @@ def hats(values: np.ndarray, first: float, distance: float, count: int, period: 
     return basis
 
 
-def best_period(
-    responses: Responses, what: str, shortest: float = 6.0, longest: float = 90.0
-) -> tuple[float, np.ndarray]:
-    """Return the period (s) of the clock at which a sine of ``what`` explains most, and honest gains [units]."""
-    time = responses.coordinates["time"]
-    periods = np.geomspace(shortest, longest, 60)
+def best_period(responses: Responses, shortest: float = 6.0, longest: float = 150.0) -> tuple[str, float, np.ndarray]:
+    """Return quantity and period (s) of the sine over the clock that explains most, and honest gains [units]."""
+    tries = list(product(WHATS, np.geomspace(shortest, longest, 60)))
     designs = []
-    for period in periods:
-        phase = 2 * np.pi * time / period
+    for what, period in tries:
+        phase = 2 * np.pi * responses.coordinates["time"] / period
         designs.append(responses.design(what, np.stack([np.cos(phase), np.sin(phase)], axis=-1)))
-    none = np.zeros(0, int)
+    matrix, vector = (np.array([design[i] for design in designs]) for i in (0, 1))
 
-    def best(skip: np.ndarray) -> tuple[int, np.ndarray]:
-        top, winner = -np.inf, (0, np.zeros(2))
-        for k, (matrix, vector) in enumerate(designs):
-            a, g = matrix.sum(0), vector.sum(0)
-            a, g = a - matrix[skip].sum(0), g - vector[skip].sum(0)
-            c = np.linalg.solve(a + 1e-6 * np.trace(a) * np.eye(2) + 1e-12 * np.eye(2), g)
-            if c @ g > top:
-                top, winner = c @ g, (k, c)
-        return winner
+    def best(skipped: np.ndarray) -> tuple[int, np.ndarray]:
+        left, push = (x.sum(1) - x[:, skipped].sum(1) for x in (matrix, vector))
+        ridge = 1e-6 * np.trace(left, axis1=1, axis2=2) + 1e-12
+        c = np.linalg.solve(left + ridge[:, None, None] * np.eye(2), push[..., None])[..., 0]
+        k = int((c * push).sum(-1).argmax())
+        return k, c[k]
 
-    gains = np.zeros(len(designs[0][1]))
+    gains = np.zeros(matrix.shape[1])
     for mine in _by_run(responses):
         k, c = best(mine)
         for unit in mine:
-            matrix, vector = designs[k][0][unit], designs[k][1][unit]
-            gains[unit] = log_gain(float(2 * c @ vector - c @ matrix @ c), responses.square[unit])
-    return float(periods[best(none)[0]]), gains
+            gained = float(2 * c @ vector[k, unit] - c @ matrix[k, unit] @ c)
+            gains[unit] = log_gain(gained, responses.square[unit])
+    return *tries[best(np.zeros(0, int))[0]], gains

@@ -131,11 +131,11 @@ def agreement(
 ) -> tuple[NoisyDrivers, dict[str, ladder.Agreement]]:
     """Return a model's drivers with their noise, and whether its errors 5 s ahead agree with that noise.
 
-    Posterior predictive p-values: ``scene`` of the share of the squared error that a smooth function of the scene takes
-    beside drift, as on the ladder with fewer features; ``sizes``, of what it tells of their sizes, which even noise
-    leaves alone; ``past``, of what a driver's other errors take; ``tails`` of that in the worst windows; ``leading``,
-    of a ``term``, of the share of the whitened squared error that it takes. Every replica has drivers' noise, that of
-    sensors (``noise_m``), and drivers fitted to it in windows of 5 s, as those of ``solution`` are to the data.
+    Posterior predictive p-values of shares of the squared error. ``scene``: what a smooth function of the scene takes
+    beside drift. ``sizes``: what it tells of the errors' sizes, which even noise leaves alone. ``past``: what a
+    driver's other errors take. ``tails``: what lies in the worst windows. ``leading``: what a ``term`` takes in
+    whitened windows. Every replica has drivers' noise and that of sensors (``noise_m``). Drivers are fitted to it in
+    windows of 5 s, as those of ``solution`` are to the data.
     """
     drivers, random = drivers_of(problem, solution, noise_m), np.random.default_rng(seed)
 

@@ -309,8 +309,8 @@ class Search:
             # Each kind has as many fits as the best names: what is told by a name has been held against both.
             for past in (False, True):
                 curve_of(*(t for t in shapes if t.past is past))
-        cycle, gains = places.best_period(responses, "acceleration")
-        term = terms.curve("acceleration", "time", 0.0, cycle / 8, 8, cycle, label="acceleration over phase")
+        what, cycle, gains = places.best_period(responses)
+        term = terms.curve(what, "time", 0.0, cycle / 8, 8, cycle, label=f"{what} over phase")
         if term.label not in have:
             if gains.mean() < worth:
                 result.append(Scored(term, None, gains))

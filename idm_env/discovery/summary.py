@@ -153,7 +153,7 @@ def _verdict(
     verdict = conclude(
         bool(added), any(f.effect for f in added), refusal, structured or unnamed > 0.0, first.left, power,
         judged.shared is not None, apart=not others,
-        in_a_state=all(f.where.coordinate in (*STATES, "state") for f in added),
+        in_a_state=all(f.where.coordinate in (*STATES, "state", "period") for f in added),
         exact=judged.is_exact(least),
     )  # fmt: skip
     if verdict is Verdict.NONE and refusal is not None:

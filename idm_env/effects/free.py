@@ -90,7 +90,7 @@ class Now(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene) -> Now:
-        """Return what a scene shows."""
+        """Return the numbers of a scene."""
         second, behind, lead = scene.second_leader, scene.behind, scene.leader
         room: tuple[Any, Any] = None, None
         if behind is not None:
