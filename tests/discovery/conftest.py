@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 import torch
 
 from idm_env.data import episodes, hidden, synthetic
+from idm_env.discovery import bases
 from idm_env.discovery.records import Records, gather
 
 
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> None:
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def two_laws() -> Iterator[None]:
+    """Compare IDM with its improved form alone: half of a search goes into laws, of which test_bases.py is."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(bases, "BASES", ("idm", "iidm"))
+        yield
 
 
 Mixing = Callable[[np.ndarray], None]

@@ -15,6 +15,8 @@ from idm_env.jobs.storage import UNFINISHED
 from idm_env.model_file import load_model
 from idm_env.roads import Lane
 
+pytestmark = pytest.mark.usefixtures("two_laws")
+
 FEW = ("lag", "leader_acceleration", "drag", "grade", "speed_zone", "regime_shift")
 
 
@@ -58,10 +60,10 @@ def test_report_files(drag: Discovery, tmp_path: Path) -> None:
 
 
 def test_nothing_is_found_where_nothing_is_hidden() -> None:
-    # Six runs of two followers for 90 s who are unsteady would not show most effects at their usual strengths.
-    for ou, verdict in ((0.0, "none"), (0.1, "cannot_tell")):
+    # Noise of drivers hides what is not there as well as what is: then nothing is ruled out.
+    for ou, verdicts in ((0.0, ["none"]), (0.3, ["cannot_tell", "undecided"])):
         found = discover(data(None, ou=ou), effects=FEW)
-        assert found.verdict == verdict
+        assert found.verdict in verdicts
         assert found.report["found"] == []
         assert found.report["error"]["after"] == found.report["error"]["before"]
 

@@ -11,6 +11,8 @@ from idm_env.discovery.judge import Judged
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.verdict import Verdict
 
+pytestmark = pytest.mark.usefixtures("two_laws")
+
 
 @pytest.fixture(scope="module")
 def records() -> Records:

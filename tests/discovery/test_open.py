@@ -23,6 +23,8 @@ from idm_env.model_file import load_model, save_model
 from idm_env.parameters import Parameter
 from tests.discovery.test_march import agrees
 
+pytestmark = pytest.mark.usefixtures("two_laws")
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "add_an_effect.py"
 
 

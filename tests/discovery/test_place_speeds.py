@@ -9,6 +9,8 @@ import pytest
 from idm_env.data import synthetic
 from idm_env.discovery import discover
 
+pytestmark = pytest.mark.usefixtures("two_laws")
+
 
 def test_a_lateral_acceleration_is_found_where_the_path_is_measured() -> None:
     """And where it is not, the candidate says what it lacks."""

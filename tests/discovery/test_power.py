@@ -8,6 +8,8 @@ from idm_env.data import synthetic
 from idm_env.discovery import discover
 from idm_env.discovery.power import WIDTHS, strength_of
 
+pytestmark = pytest.mark.usefixtures("two_laws")
+
 
 def test_a_latency_below_one_step_is_nobody_s() -> None:
     """It becomes part of the null, so that it is never found, however sure it is."""

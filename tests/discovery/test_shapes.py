@@ -25,6 +25,8 @@ from idm_env.reports.undecided import FOUND
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 
+pytestmark = pytest.mark.usefixtures("two_laws")
+
 FEW = {"runs": 10, "followers": 2, "seconds": 120.0}
 
 

@@ -11,6 +11,8 @@ from idm_env.discovery import discover
 from idm_env.discovery.search import WORTH
 from tests.discovery import sumo
 
+pytestmark = pytest.mark.usefixtures("two_laws")
+
 
 def test_a_response_at_the_same_bends_is_no_place() -> None:
     laps, _ = synthetic.generate(1, effect="lag", laps=True, runs=8, followers=2, seconds=120.0)

@@ -38,6 +38,8 @@ from idm_env.discovery.shared import Shared
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves
 from idm_env.effects import ALL, CANDIDATES, base_named
 
+pytestmark = pytest.mark.usefixtures("two_laws")
+
 BETTER, SAME, WORSE = (Comparison(1.0, ratio, ratio, ratio - 0.05, ratio + 0.05) for ratio in (0.9, 0.99, 1.1))
 UP, FAR_UP = (Comparison(1.0, ratio, ratio, 0.9, 1.2) for ratio in (1.01, 1.08))
 
