@@ -69,7 +69,8 @@ def test_there_is_one_protocol() -> None:
     from idm_env.trajectories.files import filter_file
 
     for long in (fit, fit_file, simulate_file, discover, filter_file, predict_files, bench.run):
-        assert inspect.signature(long).parameters["on_progress"].annotation == "OnProgress | None", long
+        kind = inspect.signature(long).parameters["on_progress"].annotation
+        assert kind in ("OnProgress | None", progress.OnProgress | None), long
     package = Path(idm_env.__file__).parent
     assert [p.name for p in package.rglob("*.py") if "\nOnProgress =" in p.read_text()] == ["progress.py"]
 
