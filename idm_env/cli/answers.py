@@ -57,8 +57,9 @@ def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> Non
     if not result["models"]:
         undecided(result, out)
         return
-    from idm_env.discovery.result import Ceilings, Weight
-    from idm_env.discovery.words import ceilings, error_rows, laws, weight
+    from idm_env.discovery.result import Ceilings
+    from idm_env.discovery.rolled import Rolled
+    from idm_env.discovery.words import ceilings, error_rows, rolled
     from idm_env.reports.undecided import FOUND
 
     console.print(Text.assemble("Verdict: ", (result["verdict"].replace("_", " "), "bold"), ". "), end="")
@@ -66,14 +67,11 @@ def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> Non
     before = result["error"]["before"]
     if before is not None:
         show("Errors on the test set", error_rows(result, models))
-    if result["interval"]:
-        console.print(result["interval"], style="dim", highlight=False)
-    console.print(weight(Weight(**result["prior"])), style="dim", highlight=False)
+    for name, state, text in rolled({file: Rolled(**figures) for file, figures in result["rolled"].items()}):
+        console.print(f"{name}: {text}", style="bold red" if state else "", highlight=False)
     if before is not None:
         limits = ceilings(Ceilings(**result["ceilings"]), before["gap_rmse_m"], result["error"]["floor"]["gap_rmse_m"])
         console.print(f"What could be explained at all: {limits}", style="dim", highlight=False)
-    if result["bases"]:
-        console.print(laws(result["bases"]), soft_wrap=True, highlight=False)
     files = sorted(result["models"].items(), key=lambda item: item[0] != "model.yaml")
     best = ", what the verdict says" if len(files) > 1 else ""
     words = (f"{file} is {name}{best if not i else ''}" for i, (file, name) in enumerate(files))

@@ -3,16 +3,16 @@
 One of them is there once more, with the strengths of effects that are each driver's own.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 from idm_env.discovery import model as terms
-from idm_env.discovery.compare import Comparison, ErrorChange, compare
+from idm_env.discovery.compare import Comparison, ErrorChange, changes, compare
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
-from idm_env.discovery.result import Against, LawErrors
+from idm_env.discovery.result import LawErrors
 from idm_env.discovery.verdict import improves, mean_ratio
 from idm_env.effects import ALL, BASES, CarFollowing, base_named, make
 
@@ -132,10 +132,5 @@ def rows(laws: Iterable[Law]) -> list[LawErrors]:
         names = each.law.kind, each.title, each.law.equation, list(each.own), list(each.model.catalogue.without)
         bounds = {name: n for name, n in each.at_bounds.items() if n}
         errors: Any = each.errors.summary()
-        rows.append(LawErrors(*names, each.parameters, bounds, **errors, against=against_rows(each.against)))
+        rows.append(LawErrors(*names, each.parameters, bounds, **errors, against=changes(each.against)))
     return rows
-
-
-def against_rows(against: Mapping[str, Comparison]) -> dict[str, Against]:
-    """Return a report's row of how errors compare."""
-    return {key: Against(c.outcome.value, c.ratio, c.low, c.high) for key, c in against.items()}

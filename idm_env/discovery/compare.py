@@ -1,5 +1,6 @@
 """Is an error on the test set better, the same or worse, and how sure is that: bootstrap over followers or runs."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -7,6 +8,7 @@ import numpy as np
 from scipy.stats import binomtest, t as student
 
 from idm_env.discovery.judge import Judged
+from idm_env.discovery.result import Change
 
 DRAWS = 2000
 RUNS = 6
@@ -58,6 +60,16 @@ class Comparison:
         return ErrorChange.BETTER if below else ErrorChange.SAME
 
     @property
+    def interval(self) -> str:
+        """The 95 % interval that the outcome goes by, in words: the pooled one, or that of the mean driver."""
+        if not np.isfinite(self.high):
+            return "–"
+        if self.outcome is ErrorChange.SAME or not self.low <= 1.0 <= self.high:
+            return f"{percent(self.low)} to {percent(self.high)}"
+        mean, low, high = map(percent, self.driver)
+        return f"mean driver {mean}, {low} to {high}"
+
+    @property
     def most_worse(self) -> bool:
         """Whether the error of the median follower rises beyond chance (sign test, 5 %)."""
         if not self.followers or not np.isfinite(self.improved):
@@ -75,6 +87,21 @@ def compare(before: Judged, after: Judged, seed: int = 0, among: np.ndarray | bo
         seen = (count > 0) & among
         result[key] = compared(was[seen], now[seen], count[seen], runs[seen], seed)
     return result
+
+
+def changes(errors: Mapping[str, Comparison]) -> dict[str, Change]:
+    """Return how errors changed, as a report has it."""
+    return {
+        key: Change(
+            c.outcome.value, c.ratio, c.low, c.high, c.before, c.after, "m/s" if key.endswith("mps") else "m",
+            *c.driver, c.improved, *c.trimmed, c.interval,
+        ) for key, c in errors.items()
+    }  # fmt: skip
+
+
+def percent(ratio: float) -> str:
+    """Return the change that a ratio means, with its sign, in percent."""
+    return f"{100.0 * (ratio - 1.0):+.1f}\N{NO-BREAK SPACE}%".replace("-", "−")
 
 
 def compared(was: np.ndarray, now: np.ndarray, samples: np.ndarray, runs: np.ndarray, seed: int) -> Comparison:

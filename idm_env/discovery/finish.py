@@ -27,6 +27,7 @@ from idm_env.discovery.judgement import Evaluation, Judgement, judgement_of
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records
 from idm_env.discovery.result import Result
+from idm_env.discovery.rolled import roll
 from idm_env.discovery.selection import Decided, Round
 from idm_env.discovery.solve import Problem, Solution
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, improves
@@ -50,7 +51,6 @@ class Discovery:
     problem: Problem
     rounds: list[Round]
     judgement: Judgement
-    responses: places.Responses
 
     @property
     def verdict(self) -> Verdict:
@@ -132,10 +132,12 @@ def finished(
     result = summary.summarise(*judged, refused | evaluation.searching.unplaced, by, limits)
     saved = _saved(trajectories, evaluation, judgement, of_laws, (first, last, of_law), by)
     models = dict(zip(judgement.names(), saved, strict=True))
+    speed = float(np.median(prepared.speed[prepared.speed > 1.0])) if (prepared.speed > 1.0).any() else 1.0
+    # The model of the verdict first, beside the law that was to be completed.
+    rolls = {f: roll(models[f], speed) for f in ("model.yaml", "model_idm.yaml") if f in models}
+    result = replace(result, rolled={file: one for file, one in rolls.items() if one is not None})
     shown = null if judgement.compared is None else judgement.compared
-    return Discovery(
-        result, models, prepared, null, shown, problem, decided.rounds, judgement, places.respond(problem, shown)
-    )
+    return Discovery(result, models, prepared, null, shown, problem, decided.rounds, judgement)
 
 
 Found = tuple[Evaluation, Decided, Judgement, Solution]

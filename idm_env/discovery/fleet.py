@@ -8,8 +8,8 @@ from itertools import combinations
 import numpy as np
 
 from idm_env.discovery import judge, result
-from idm_env.discovery.bases import LEAST, Law, against_rows
-from idm_env.discovery.compare import ERRORS, Comparison, compare
+from idm_env.discovery.bases import LEAST, Law
+from idm_env.discovery.compare import ERRORS, Comparison, changes, compare
 from idm_env.discovery.crossed import in_blocks
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.model import Hypothesis
@@ -196,7 +196,7 @@ def told(fleet: Kinds) -> result.Fleet:
         errors, with_one = ({k: _pooled(*s, mine) for k, s in j.squares.items()} for j in (fleet.errors, fleet.one))
         classes = list(fleet.classes[i]) if fleet.column else []
         kinds.append(result.Kind(law.law.kind, law.title, classes, drivers[mine].tolist(), errors, with_one))
-    return result.Fleet(fleet.column, kinds, fleet.agreed, against_rows(fleet.against))
+    return result.Fleet(fleet.column, kinds, fleet.agreed, changes(fleet.against))
 
 
 def _pooled(square: np.ndarray, count: np.ndarray, mine: np.ndarray) -> float:

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from idm_env.discovery import pictures, words
+from idm_env.discovery.compare import percent as change
 from idm_env.discovery.finish import Discovery
-from idm_env.discovery.result import Against, Change, Result
+from idm_env.discovery.result import Change, Result
 from idm_env.discovery.score import ALPHA, CLOSED_LOOP_SHARE
 from idm_env.discovery.selection import LEAST_GAIN, LEAST_SHARE
 from idm_env.discovery.units import ENOUGH_RUNS, MANY_RUNS
 from idm_env.discovery.verdict import HOLDS, Reason, Verdict
-from idm_env.discovery.words import percent as change
 from idm_env.reports import page as pages
 
 TITLES = {
@@ -33,13 +33,18 @@ def write(path: Path, d: Discovery) -> None:
     """Write the page."""
     r, judgement, law = d.result, d.judgement, d.null.model.catalogue.base.title
     before = r.error.before
-    filters: dict[str, Any] = {"number": number, "percent": percent, "change": change, "changes": changes}
+    filters: dict[str, Any] = {"number": number, "percent": percent, "change": change}
     filters |= {"ends": _ends, "plain": words.plain, "amount": words.amount}
     filters["shares"] = lambda parts: " · ".join(f"{name} {percent(share)}" for name, share in parts.items())
     rules = {"enough_runs": ENOUGH_RUNS, "many_runs": MANY_RUNS, "free_share": f"{CLOSED_LOOP_SHARE:.0%}"}
     rules |= {"level": percent(ALPHA), "least_gain": percent(LEAST_GAIN, 1), "least_share": percent(LEAST_SHARE)}
     names: dict[str, Any] = {"r": r, "d": d, "law": law, "rules": rules | {"holds": f"{HOLDS - 1.0:.0%}"}}
-    names |= {"titles": judgement.titles, "cards": cards(r, law), "draw": pictures, "picture": pages.picture}
+    names |= {
+        "titles": judgement.titles,
+        "cards": cards(r, law) + words.rolled(r.rolled),
+        "draw": pictures,
+        "picture": pages.picture,
+    }
     names |= {"error_names": words.ERRORS, "most": words.MANY, "shortened": pages.shortened}
     names |= {"rows": words.error_rows(d.report, list(judgement.results)), "weight": words.weight(r.prior)}
     names["declared"] = {p.name: p for p in d.null.model.catalogue.own}
@@ -52,20 +57,19 @@ def write(path: Path, d: Discovery) -> None:
 def _title(r: Result) -> str:
     if r.fleet is not None:
         return "Drivers follow several laws here"
-    return TITLES[Verdict(r.verdict)] if _better(r) is None else "Another law predicts better than {law} here"
+    if _better(r) is None:
+        return TITLES[Verdict(r.verdict)]
+    own = any(base.own for base in r.bases if base.title == r.models["model.yaml"])
+    return "Every driver differs from {law} here" if own else "Another law predicts better than {law} here"
 
 
-def _better(r: Result) -> dict[str, Against] | None:
+def _better(r: Result) -> dict[str, Change] | None:
     """Return how the errors of what goes before every effect compare: of laws by kind of driver, or of a better law."""
     if r.fleet is not None:
         return r.fleet.against
     if r.reason != Reason.LAW.value:
         return None
     return next((base.against for base in r.bases if base.title == r.models["model.yaml"]), None)
-
-
-def _is_finite(x: float | None) -> bool:
-    return x is not None and math.isfinite(x)
 
 
 def number(x: float | None, digits: int = 3) -> str:
@@ -80,21 +84,8 @@ def percent(x: float | None, digits: int = 0) -> str:
     return "–" if x is None or not math.isfinite(x) else f"{100 * x:.{digits}f} %".replace("-", "−")
 
 
-def changes(of: Change | Against, dots: str = " … ") -> str:
-    """Return the interval of an error's ratio, as changes in percent."""
-    return f"{change(of.low)}{dots}{change(of.high)}" if math.isfinite(of.high) else "–"
-
-
 def _ends(interval: tuple[float | None, float | None]) -> str:
-    return " … ".join(percent(x, 2) for x in interval) if all(map(_is_finite, interval)) else "–"
-
-
-def _in_units(r: Result, key: str) -> str:
-    """Return an error before and after, in its unit; nothing where several laws come after."""
-    base = next((base for base in r.bases if base.title == r.models["model.yaml"]), None)
-    if base is None or r.error.before is None or r.fleet is not None:
-        return ""
-    return f"{number(r.error.before[key])} → {number(getattr(base, key))} {words.ERRORS[key][1]}, "
+    return "–" if None in interval else " … ".join(percent(x, 2) for x in interval)
 
 
 def _later(r: Result) -> list[tuple[str, str, str]]:
@@ -106,21 +97,11 @@ def _later(r: Result) -> list[tuple[str, str, str]]:
 
 def cards(r: Result, law: str) -> list[tuple[str, str, str]]:
     """Return the first screen's cards: how each error changed or, where nothing is compared, what is known instead."""
-    if (better := _better(r)) is not None:
-        return [
-            (
-                words.ERRORS[key][0].capitalize(),
-                a.verdict,
-                f"{_in_units(r, key)}{change(a.ratio)} ({changes(a, ' to ')})",
-            )
-            for key, a in better.items()
-        ] + _later(r)
-    if r.helps:
+    if changes := _better(r) or r.helps:
         rows = _later(r)
-        for key, h in r.helps.items():
-            interval = f" ({changes(h, ' to ')})" if math.isfinite(h.high) else ""
-            size = f"{number(h.before)} → {number(h.after)} {h.unit}, {change(h.ratio)}{interval}"
-            rows.append((words.ERRORS[key][0].capitalize(), h.verdict, size))
+        for key, c in changes.items():
+            size = f"{number(c.before)} → {number(c.after)} {c.unit}, {change(c.ratio)} ({c.interval})"
+            rows.append((words.ERRORS[key][0].capitalize(), c.verdict, size))
         return rows
     facts = [("Runs", f"{r.data.runs}, of them {r.data.runs_to_choose_on} for model selection")]
     if r.verdict == Verdict.CANNOT_TELL.value:

@@ -10,12 +10,10 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.interpolate import interp1d
 
 from idm_env.discovery import words
 from idm_env.discovery.judge import halves
 from idm_env.discovery.solve import projected
-from idm_env.effects.free import FEATURES
 
 if TYPE_CHECKING:
     from idm_env.discovery.finish import Discovery
@@ -115,38 +113,6 @@ def dependences(ladder: Ladder | None) -> Figure | None:
         axis.axhline(0, color=TRUTH, lw=0.5)
         axis.set_xlabel(curve.coordinate + ("" if curve.unit == "1" else f" ({curve.unit})"))
     figure.supylabel("simulated less measured gap (m)", fontsize=9)
-    return figure
-
-
-def _residual(d: Discovery) -> list[np.ndarray]:
-    """Return the residual acceleration before and after [R, J]: how much more the driver gains in speed each second."""
-    problem, rows, dt = d.problem, d.problem.rows, d.problem.rows.records.dt
-    ends = dt * rows.seconds
-    shown = []
-    for s in (d.null, d.final)[: len(d.judgement.titles)]:
-        speed = np.pad(problem.errors(s.theta[None], s.model, s.values[None])[0, :, :-2], ((0, 0), (1, 0)))
-        shown.append(-np.diff(interp1d(dt * rows.every * np.arange(speed.shape[1]), speed)(ends), axis=1))
-    return shown
-
-
-def features(d: Discovery) -> Figure:
-    """Binned means over position, time, and every state that a shape may run over."""
-    figure, axes = plt.subplots(3, 4, layout="constrained", figsize=(10.0, 7.2), sharey=True)
-    for mend, colour, label in zip(_residual(d), (BEFORE, AFTER), d.judgement.titles, strict=False):
-        for axis, (name, values) in zip(axes.ravel(), d.responses.coordinates.items(), strict=False):
-            edges = np.unique(np.quantile(values, np.linspace(0.01, 0.99, 17)))
-            index = np.digitize(values.ravel(), edges) - 1
-            points = []
-            for b in range(len(edges) - 1):
-                mine = mend.ravel()[index == b]
-                if len(mine) > 5:
-                    centre, error = 0.5 * (edges[b] + edges[b + 1]), 2.0 * np.std(mine) / np.sqrt(len(mine))
-                    points.append((centre, np.mean(mine), error))
-            axis.errorbar(*np.reshape(points, (-1, 3)).T, color=colour, lw=1.1, marker=".", ms=4, label=label)
-            axis.axhline(0, color=TRUTH, lw=0.5)
-            axis.set_xlabel(words.ALONG[name] + ("" if FEATURES[name] == "1" else f"\n({FEATURES[name]})"))
-    figure.legend(handles=axes[0, 0].get_legend_handles_labels()[0], loc="outside upper left", ncols=2)
-    figure.supylabel("residual (m/s²)", fontsize=9)
     return figure
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from idm_env.discovery.ladder import Ladder
+from idm_env.discovery.rolled import Rolled
 from idm_env.discovery.shared import Shared
 
 SCHEMA = 3
@@ -74,7 +75,10 @@ class GivenParameter:
 
 @dataclass(frozen=True)
 class Change:
-    """How an error changed on the test set, pooled and as the mean of drivers' own ratios, with 95 % intervals."""
+    """How an error changed on the test set, pooled and as the mean of drivers' own ratios, with 95 % intervals.
+
+    ``interval`` is the one that the verdict goes by, in words.
+    """
 
     verdict: str
     ratio: float
@@ -89,6 +93,7 @@ class Change:
     share_of_drivers_improved: float
     trimmed_before: float
     trimmed_after: float
+    interval: str
 
 
 @dataclass(frozen=True)
@@ -221,16 +226,6 @@ class Ceilings:
 
 
 @dataclass(frozen=True)
-class Against:
-    """An error's ratio to that of the first law, with its 95 % interval."""
-
-    verdict: str
-    ratio: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
 class LawErrors:
     """A law alone: its errors, and how they compare with the null's; ``own`` are effects of each driver's strength.
 
@@ -249,7 +244,7 @@ class LawErrors:
     horizon_rmse_m: float
     speed_rmse_mps: float
     gap_rmse_median_driver_m: float
-    against: dict[str, Against]
+    against: dict[str, Change]
 
 
 @dataclass(frozen=True)
@@ -262,7 +257,7 @@ class Completed:
     base: str
     title: str
     own: list[str]
-    against: dict[str, Against]
+    against: dict[str, Change]
 
 
 @dataclass(frozen=True)
@@ -290,7 +285,7 @@ class Fleet:
     column: str
     kinds: list[Kind]
     agreed: int
-    against: dict[str, Against]
+    against: dict[str, Change]
 
 
 @dataclass(frozen=True)
@@ -322,3 +317,4 @@ class Result:
     bases: list[LawErrors]
     completed: Completed | None
     fleet: Fleet | None
+    rolled: dict[str, Rolled]

@@ -8,7 +8,7 @@ import numpy as np
 
 from idm_env.data import Trajectories, noise_sigma
 from idm_env.discovery import bases, crossed, fleet, judge, result, words
-from idm_env.discovery.compare import DRAWS, Comparison, compare, unit_of
+from idm_env.discovery.compare import DRAWS, Comparison, changes, compare, unit_of
 from idm_env.discovery.judgement import Evaluation, Judgement
 from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.march import CURVE
@@ -65,30 +65,24 @@ def summarise(
     if (verdict in (Verdict.NONE, Verdict.UNDECIDED) and is_large) or refusal == Refusal(Reason.TAILS):
         sentence = words.beside_noise(verdict, law, *left, judged.ladder)
     after = judged.after if judged.added else before
-    sentence = " ".join(
-        filter(None, (*_of_laws(judged, drivers[0] if judged.on is not None else drivers[2]), sentence))
-    )
-    weight, beyond = decided.null_in_closed_loop, _against_first(judged)
+    of_laws, of_law = _of_laws(judged, drivers[0] if judged.on is not None else drivers[2])
+    sentence = " ".join(filter(None, (*of_laws, sentence)))
+    weight, beyond, base_law = decided.null_in_closed_loop, _against_first(judged), (judged.beneath or judged).titles[0]
     return result.Result(
         schema=result.SCHEMA,
         verdict=verdict.value,
         reason=None if refusal is None else refusal.reason.value,
         sentence=sentence,
         details=[
-            *words.details(verdict, added, nearest, 1.0 - float(np.exp(-first.smooth_gain))),
-            *([words.beyond(judged.titles[-1], judged.beneath.titles[0], beyond)] if judged.beneath else []),
+            *of_law,
+            *words.details(added, nearest),
+            *([f"Against {base_law}, {judged.titles[-1]}: {words.change_of(beyond)}."] if beyond else []),
             *words.agreement(judged.ladder, first.leading),
             *words.cautions(data.at_bounds if judged.law is None else judged.law.at_bounds, data.drivers),
         ],
         found=added,
         known=_known(final, interval_of(final, problem), base),
-        helps={
-            key: result.Change(
-                c.outcome.value, c.ratio, c.low, c.high, c.before, c.after, words.ERRORS[key][1], *c.driver, c.improved,
-                *c.trimmed,
-            )
-            for key, c in errors.items()
-        },
+        helps=changes(errors),
         ladder=judged.ladder,
         interval=_how(before) if errors and before is not None else None,
         models=judged.names(),
@@ -113,8 +107,9 @@ def summarise(
         ceilings=ceilings,
         bases=bases.rows(laws),
         completed=None if (on := judged.on) is None
-        else result.Completed(on.law.kind, on.title, list(on.own), bases.against_rows(beyond)),
+        else result.Completed(on.law.kind, on.title, list(on.own), changes(beyond)),
         fleet=None if judged.fleet is None else fleet.told(judged.fleet),
+        rolled={},
     )  # fmt: skip
 
 
@@ -125,16 +120,17 @@ def _against_first(judged: Judgement) -> dict[str, Comparison]:
     return compare(judged.beneath.before, judged.after, judged.seed)
 
 
-def _of_laws(judged: Judgement, drivers: Solution | None) -> list[str]:
-    """Return what is said of laws before effects; ``drivers`` are the parameters of one that is better."""
-    null = judged.null.model.catalogue.base.title
-    sentences = [] if judged.fleet is None else [words.fleet_first(judged.fleet)]
-    if judged.on is not None and judged.beneath is not None:
-        sentences.append(words.law_first(judged.on, judged.beneath.titles[0], drivers, "what it lacks follows"))
-    if judged.law is not None:
-        note = "" if judged.sought is None else words.none_holds(judged.sought.refusal, judged.sought.tried)
-        sentences.append(words.law_first(judged.law, null, drivers, note))
-    return sentences
+def _of_laws(judged: Judgement, drivers: Solution | None) -> tuple[list[str], list[str]]:
+    """Return what is said of laws before effects, and in detail; ``drivers`` are the parameters of a better one."""
+    law, kinds = judged.on or judged.law, judged.fleet
+    first, more = ([], []) if kinds is None else ([words.fleet_first(kinds)], words.fleet_details(kinds))
+    if law is not None:
+        first.append(words.law_first(law, (judged.beneath or judged).titles[0], drivers))
+        more += words.law_details(law, judged.on is not None)
+    if judged.law is not None and judged.sought is not None:
+        why = words.reason(judged.sought.refusal, judged.sought.tried) or "no error falls beyond chance"
+        more.append(f"No effect added to it holds: {why}.")
+    return first, more
 
 
 def _verdict(

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from idm_env.discovery.bases import LEAST, Law
-from idm_env.discovery.compare import Comparison, ErrorChange
+from idm_env.discovery.compare import Comparison, ErrorChange, percent
 from idm_env.discovery.fleet import Kinds
 from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.model import Term
 from idm_env.discovery.result import Ceilings, TermFinding, Weight
-from idm_env.discovery.score import ALPHA, Contrast
+from idm_env.discovery.rolled import FOLLOWERS, Rolled
+from idm_env.discovery.score import Contrast
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution
 from idm_env.discovery.tails import WORST
@@ -51,6 +52,8 @@ ALONG = {
     "headway_behind": "time gap of the follower", "gap_behind": "gap of the follower",
     "second_opening": "speed of the second leader over the leader's",
 }  # fmt: skip
+MOST = 0.75
+"""Share of drivers on one side of a null from which their strengths are told as what drivers do."""
 MANY = 4
 """A term with more parameters than this is a curve: its range is told instead."""
 
@@ -63,11 +66,6 @@ def number(x: float, digits: int = 3) -> str:
 def amount(x: float, unit: str) -> str:
     """Return a number with its unit."""
     return number(x) if unit == "1" else f"{number(x)} {unit}"
-
-
-def percent(ratio: float) -> str:
-    """Return the change that a ratio means, with its sign, in percent."""
-    return f"{100.0 * (ratio - 1.0):+.1f}\N{NO-BREAK SPACE}%".replace("-", "−")
 
 
 def plain(name: str) -> str:
@@ -197,12 +195,12 @@ def headline(
     if shared is not None and not clauses:
         return common(shared)
     if verdict in (Verdict.NAMED, Verdict.ONE_OF, Verdict.SHAPE, Verdict.LOCATED):
-        text = ", and ".join(clauses)
-        without = verdict in (Verdict.SHAPE, Verdict.LOCATED)
-        unnamed = "; the catalogue has no name for it" if without else ""
+        parts = [f"{text[0].upper()}{text[1:]}." for text in clauses]
         if verdict is Verdict.ONE_OF:
-            unnamed = f"; or {' or '.join(plain(x) for x in others)}, which these data do not tell from it"
-        return f"{text[0].upper()}{text[1:]}{unnamed}{_but(errors)}."
+            parts.append(f"These data do not tell it from {' or '.join(plain(x) for x in others)}.")
+        elif verdict is not Verdict.NAMED:
+            parts.append("The catalogue has no name for it.")
+        return " ".join([*parts, *_but(errors)])
     if verdict is Verdict.NONE and refusal is not None and refusal.reason is Reason.SMALL_SIZE:
         return f"Nothing of practical size is missing: {reason(refusal, tried)}."
     if verdict is Verdict.NONE:
@@ -221,15 +219,15 @@ def headline(
 
 def beside_noise(verdict: Verdict, law: str, left_m: float, floor_m: float, ladder: Ladder | None) -> str:
     """Say of errors 5 s ahead far above the sensors' ``floor_m`` whether noise of drivers may be all that they are."""
-    error = f"{law} leaves {number(left_m, 2)} m 5 s ahead, {left_m / floor_m:.0f} times the sensors' noise"
+    error = f"{law} leaves {number(left_m, 2)} m 5 s ahead, where sensors' noise is {number(floor_m, 2)} m"
     drivers = "unsteady drivers"
     if ladder is not None and ladder.unsteady is not None and ladder.unsteady[0] > 0.0:
         drivers += f" of σ = {number(ladder.unsteady[0], 2)} m/s² (memory {number(ladder.unsteady[1])} s)"
     if verdict is Verdict.NONE:
-        return f"Nothing is missing that these data could show: {error}, as {drivers} do."
+        return f"{error}: {drivers} do so. Nothing is missing that these data could show."
     if verdict is Verdict.UNDECIDED:
-        return f"{error}; {drivers} would explain it, and so would an effect of a form that was not tried."
-    return f"{error}, and no candidate explains it. {' '.join(tails(ladder))}"
+        return f"{error}. U{drivers[1:]} would explain it, and so would an effect of a form that was not tried."
+    return f"{error}. No candidate explains it. {' '.join(tails(ladder))}"
 
 
 def tails(ladder: Ladder | None) -> list[str]:
@@ -247,8 +245,8 @@ def common(shared: Shared) -> str:
     more = "more" if shared.accel_mps2 > 0 else "less"
     return (
         f"The {shared.vehicles} followers of run {shared.run} all accelerate {more} than the model between "
-        f"{shared.begin_s:.0f} and {shared.end_s:.0f} s, by {number(abs(shared.accel_mps2), 2)} m/s² on average: "
-        "something that they share there, and no driver's own noise; the catalogue has no name for it."
+        f"{shared.begin_s:.0f} and {shared.end_s:.0f} s, by {number(abs(shared.accel_mps2), 2)} m/s² on average. "
+        "They share it, so it is no driver's own noise. The catalogue has no name for it."
     )
 
 
@@ -268,23 +266,23 @@ def _rises(errors: Mapping[str, Comparison]) -> str:
     return "errors rise on the whole"
 
 
-def _but(errors: Mapping[str, Comparison]) -> str:
+def _but(errors: Mapping[str, Comparison]) -> list[str]:
     """Say what the errors on the test set take from a finding."""
     worse = [ERRORS[k][0] for k, c in errors.items() if c.outcome is ErrorChange.WORSE]
     if worse:
-        return f"; on the test set the error of the {' and the '.join(worse)} is larger with it"
+        return [f"On the test set the error of the {' and the '.join(worse)} is larger with it."]
     if errors and not any(c.outcome is ErrorChange.BETTER for c in errors.values()):
-        return "; no error on the test set is significantly lower with it"
+        return ["No error on the test set is significantly lower with it."]
     gap = errors.get("gap_rmse_m")
     if gap is not None and gap.driver[0] > 1.0 + LEAST:
-        return f"; of the mean follower the gap in free simulation errs {percent(gap.driver[0])}"
-    return ""
+        return [f"The mean driver's error of the gap in free simulation changes by {percent(gap.driver[0])}."]
+    return []
 
 
-def details(verdict: Verdict, found: Sequence[TermFinding], nearest: Sequence[TermFinding], left: float) -> list[str]:
+def details(found: Sequence[TermFinding], nearest: Sequence[TermFinding]) -> list[str]:
     """Say how sure it is, what it is confused with and what data would tell.
 
-    ``nearest`` are the terms that came nearest where nothing was added; ``left`` is what could still be gained.
+    ``nearest`` are the terms that came nearest where nothing was added.
     """
     parts = []
     for f in found:
@@ -292,8 +290,6 @@ def details(verdict: Verdict, found: Sequence[TermFinding], nearest: Sequence[Te
             f"{f.title[0].upper()}{f.title[1:]}: p = {number(f.p_value, 2)} over the whole list of candidates; first "
             f"of it in {f.chosen_in_folds:.0%} of choices without a fold of the runs."
         )
-        if f.p_value >= ALPHA:
-            parts.append("Few runs can show it, and all of these gain by it.")
         if f.equivalent:
             parts.append(f"These data cannot tell it from {', '.join(plain(x) for x in f.equivalent)}.")
         rivals = [plain(x) for x in f.rivals if x not in f.equivalent]
@@ -303,17 +299,8 @@ def details(verdict: Verdict, found: Sequence[TermFinding], nearest: Sequence[Te
             parts.append(f"It is most easily confused with {', '.join(spoken(x) for x in f.looks_like[:3])}.")
         if f.told_by:
             parts.append(f"What would tell: {f.told_by}.")
-    if verdict in (Verdict.NONE, Verdict.UNDECIDED):
-        parts.append(
-            f"A smooth function of the state without a name would lower the 5 s error by {100 * max(left, 0.0):.1f} % "
-            "on these runs. That no candidate helps does not say what the rest is."
-        )
-    if verdict is Verdict.CANNOT_TELL:
-        parts.append("The ranking below is a hint, not a finding.")
     if nearest:
         parts.append(f"Nearest came, without being added: {', and '.join(f.clause for f in nearest)}.")
-    if verdict is Verdict.UNEXPLAINED:
-        parts.append("The ranking and the residual against features below say where to look.")
     return parts
 
 
@@ -340,68 +327,60 @@ def agreement(ladder: Ladder | None, leading: Term | None) -> list[str]:
 
 
 def fleet_first(fleet: Kinds) -> str:
-    """Say which drivers follow which law, and what that is worth against one model for all."""
-    kinds = [
-        f"{count}{f' of {len(fleet.group)} drivers' if not i else ''}"
-        f"{f' ({fleet.column} {_any(fleet.classes[i])})' if fleet.column else ''} "
-        f"{'are predicted best ' if not i else ''}by {law.title}"
-        for i, (law, count) in enumerate(zip(fleet.laws, fleet.counts, strict=True))
-    ]
-    note = f"told by half of each driver's time, judged on the other; the halves agree for {fleet.agreed}"
+    """Return the number of drivers of every law, and the change of an error against one model for all."""
+    texts: list[str] = []
+    for law, count, classes in zip(fleet.laws, fleet.counts, fleet.classes or [()] * len(fleet.laws), strict=True):
+        who = f" ({fleet.column} {' or '.join(classes)})" if fleet.column else ""
+        which = f"{count}{who}" if texts else f"{count} of {len(fleet.group)} drivers{who} are predicted best"
+        texts.append(f"{which} by {law.title}")
+    return f"{', '.join(texts)}. Against one model for all, {change_of(fleet.against)}."
+
+
+def fleet_details(fleet: Kinds) -> list[str]:
+    """Say how kinds of drivers were told, and where to go on."""
     if fleet.column:
-        note = f"what a kind lacks: explain --where {fleet.column}={fleet.classes[0][0]}"
-    return f"{', '.join(kinds)}; against one model for all: {_changes(fleet.against)} ({note})."
+        return [f"What a kind lacks: explain --where {fleet.column}={fleet.classes[0][0]}."]
+    return [f"Kinds are told by half of each driver's time, judged on the other; {fleet.agreed} drivers' halves agree."]
 
 
-def _any(values: Sequence[str]) -> str:
-    return values[0] if len(values) == 1 else f"{', '.join(values[:-1])} or {values[-1]}"
+def change_of(against: Mapping[str, Comparison]) -> str:
+    """Say of one error by how much it changes: that 5 s ahead, or else the first that falls beyond chance."""
+    better = [key for key, c in against.items() if c.outcome is ErrorChange.BETTER]
+    key = "horizon_rmse_m" if "horizon_rmse_m" in better or not better else better[0]
+    return f"{ERRORS[key][0]} {percent(against[key].ratio)} (95 %: {against[key].interval})"
 
 
-def _changes(against: Mapping[str, Comparison]) -> str:
-    """Say which errors fall beyond chance, be it pooled or of the mean follower, and which do not."""
-    better = []
-    for key, c in against.items():
-        if c.outcome is ErrorChange.BETTER:
-            (ratio, low, high), follower = (
-                ((c.ratio, c.low, c.high), "") if c.high < 1.0 else (c.driver, " of the mean driver")
-            )
-            better.append(f"{ERRORS[key][0]}{follower} {percent(ratio)} (95 %: {percent(low)} to {percent(high)})")
-    same = [ERRORS[key][0] for key, c in against.items() if c.outcome is ErrorChange.SAME]
-    return ", ".join(better) + (f"; {' and '.join(same)}: no significant difference" if same else "")
+def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
+    """Say that another law predicts better than the null, and one error; ``drivers`` are its parameters.
 
-
-def law_first(law: Law, null: str, drivers: Solution | None = None, note: str = "") -> str:
-    """Say that another law predicts better than the null, and in what; ``drivers`` are its parameters.
-
-    What was found of effects on it is a ``note``.
+    Of strengths that are each driver's own, the one that lies on one side of the null for most drivers comes first.
     """
-    if law.own and drivers is not None:
-        note = f"median driver and 10 to 90 %: {', '.join(_of_drivers(drivers))}{f'; {note}' if note else ''}"
-    note = note or f"what it lacks: explain --base {law.law.kind}"
-    title = f"{law.title[:1].upper()}{law.title[1:]}"
-    alike = f"calibrated alike, with {law.parameters} parameters a driver"
-    return f"{title} predicts better than {null} {alike}: {_changes(law.against)} ({note})."
+    better = change_of(law.against)
+    if not (law.own and drivers is not None):
+        return f"{law.title[:1].upper()}{law.title[1:]} predicts better than {null} calibrated alike: {better}."
+    share, finding = max(_of_drivers(drivers, null))
+    first = finding if share >= MOST else "Drivers differ from each other in what IDM has in common for all."
+    return f"{first} With strengths of each driver's own, {better}."
 
 
-def none_holds(refusal: Refusal | None, tried: str) -> str:
-    """Say that no effect holds on a better law, and why."""
-    why = reason(refusal, tried) or f"with {tried} no error falls beyond chance against the best of all"
-    return f"no effect added to it holds: {why}"
+def law_details(law: Law, on: bool) -> list[str]:
+    """Return a better law's title and number of parameters, and where to go on; ``on`` it effects were found."""
+    more = [] if law.own or on else [f"What it lacks: explain --base {law.law.kind}."]
+    return [f"The law is {law.title}, with {law.parameters} parameters a driver, calibrated as all others.", *more]
 
 
-def beyond(model: str, null: str, against: Mapping[str, Comparison]) -> str:
-    """Say what a better law with what was added to it does, against the law that was to be completed."""
-    return f"Against {null}, {model}: {_changes(against)}."
-
-
-def _of_drivers(drivers: Solution) -> list[str]:
-    """Return the strengths that are each driver's own: median and the range of 80 % of the drivers."""
+def _of_drivers(drivers: Solution, law: str) -> list[tuple[float, str]]:
+    """Return of every strength of the drivers' own the share of drivers on one side of its null, and a sentence."""
     catalogue, theta = drivers.model.catalogue, np.exp(drivers.theta[np.unique(drivers.row_group)])
     strengths = []
     for i, (name, p) in enumerate(catalogue.of_driver):
-        if name in catalogue.personal:
+        if name in catalogue.personal and p.role == "strength":
+            null = p.null or 0.0
             low, middle, high = np.quantile(theta[:, i], [0.1, 0.5, 0.9])
-            strengths.append(f"{p.symbol} = {number(middle, 2)} ({number(low, 2)} to {number(high, 2)})")
+            share = float(np.mean(theta[:, i] > null if middle > null else theta[:, i] < null))
+            text = ALL[name].wording[middle > null].replace("{law}", law) or plain(name)
+            values = f"{p.symbol} = {number(middle, 2)}, of 80 % of drivers {number(low, 2)} to {number(high, 2)}"
+            strengths.append((share, f"{text[0].upper()}{text[1:]} ({values}; {law}: {number(null)})."))
     return strengths
 
 
@@ -411,6 +390,28 @@ def weight(prior: Weight) -> str:
     chosen = f"{number(prior.alike_s)} s{'' if error is None else f' ({number(error)} m)'}"
     shrunk = "Drivers' parameters are shrunk towards the population mean (empirical Bayes)"
     return f"{shrunk}; strength chosen by validation, before any effect was tested: {chosen}."
+
+
+def rolled(of: Mapping[str, Rolled]) -> list[tuple[str, str, str]]:
+    """Return waves and collisions of some models: a title, "worse" where the first alone crashes, figures.
+
+    The second, where there is one, is IDM.
+    """
+    if not of:
+        return []
+    first, *_, idm = *of.values(), *of.values()
+    growth = [f"speed varies {number(x.amplification)} times as much at the last as at the first" for x in of.values()]
+    crashes = [f"{x.crashed} run into their leader" if x.crashed else "no collision" for x in of.values()]
+    rings = [
+        f"no collision, speeds differ by {number(x.wave_mps, 2)} m/s after 2 min"
+        if x.ring_s is None
+        else f"collision after {number(x.ring_s)} s"
+        for x in of.values()
+    ]
+    platoons = [f"{grows}, {crash}" for grows, crash in zip(growth, crashes, strict=True)]
+    worse = ("worse" if bad else "" for bad in (first.crashed > idm.crashed, idm.ring_s is None is not first.ring_s))
+    titles = f"{FOLLOWERS} followers of one that brakes", f"Ring of {FOLLOWERS} drivers"
+    return list(zip(titles, worse, map("; IDM: ".join, (platoons, rings)), strict=True))
 
 
 def ceilings(of: Ceilings, before_m: float | None, floor_m: float | None = None) -> str:
@@ -437,10 +438,14 @@ def error_rows(report: Mapping[str, Any], titles: Sequence[str]) -> list[dict[st
     for key, (name, unit) in ERRORS.items() if before is not None else ():
         row = {"error": f"{name} ({unit})", titles[0]: before[key]}
         if titles[1:]:
-            outcome = helps.get(key, {"verdict": "–", "high": None})
-            interval = "–" if outcome["high"] is None else f"{percent(outcome['low'])} to {percent(outcome['high'])}"
+            outcome = helps.get(key, {"verdict": "–", "interval": "–"})
             change = percent(after[key] / before[key]) if before[key] else "–"
-            row |= {titles[1]: after[key], "change": change, "95 % interval": interval, "verdict": outcome["verdict"]}
+            row |= {
+                titles[1]: after[key],
+                "change": change,
+                "95 % interval": outcome["interval"],
+                "verdict": outcome["verdict"],
+            }
         rows.append(row)
     return rows
 
@@ -449,17 +454,6 @@ def better_law(report: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """Return the row of ``report.json`` for the law that is its ``model.yaml``, where that is another one."""
     best = report["models"].get("model.yaml")
     return next((row for row in report["bases"] if row["title"] == best and row["against"]), None)
-
-
-def laws(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return in one line how the gap's error of other car-following laws compares with that of the first."""
-    first, *others = rows
-    changes = [
-        f"{row['title']} {percent(row['against']['gap_rmse_m']['ratio'])} ({row['against']['gap_rmse_m']['verdict']})"
-        for row in sorted(others, key=lambda row: float(row["gap_rmse_m"] or 0.0))
-        if row["against"].get("gap_rmse_m", {}).get("ratio") is not None
-    ]
-    return f"Other laws alone, gap in free simulation against {first['title']}: {', '.join(changes)}."
 
 
 def spoken(item: str) -> str:

@@ -34,7 +34,7 @@ def write(trajectories: Trajectories, cure: str, out: Path, inputs: Iterable[Pat
     report |= {"found": [], "known": [], "helps": {}, "ladder": None, "interval": None, "models": {}, "partial": None}
     report |= {"candidates": [], "shared": None, "excluded": [], "parameters": [], "data": trajectories.summary()}
     report["error"] = {"held_out_runs": [], "held_out_drivers": [], "before": None, "after": None}
-    report |= {"prior": None, "bases": [], "completed": None, "fleet": None, "versions": page.versions()}
+    report |= {"prior": None, "bases": [], "completed": None, "fleet": None, "rolled": {}, "versions": page.versions()}
     cards = [
         ("Recordings", "", "1"),
         ("Drivers behind a leader", "", str(len(trajectories.followers()))),

@@ -102,7 +102,7 @@ def test_a_mixed_file_has_a_law_for_each_kind_of_driver(column: str, kinds: Mixi
     true = {f"{run + 1}/{2 + i}" for run, i in zip(*np.nonzero(linear), strict=True)}
     assert set(law["drivers"]) == true if column else len(true & set(law["drivers"])) >= 6
     assert law["classes"] == (["ACC"] if column else [])
-    first = report["sentence"].split(";")[0]
+    first = report["sentence"].split(". ")[0]
     told = " (acc_run Human)", f"8 (acc_run ACC) by {law['title']}"
     count = len(idm["drivers"]), len(law["drivers"])
     assert first == (

@@ -54,5 +54,5 @@ def test_the_table_counts_what_is_false_where_nothing_was_added_and_right_names_
         usual | {"effect": "memory", "times": 2.0, "verdict": "named", "found": ["drag"], "named": ["drag"]},
     ]
     said = spiked.shown(rows)
-    assert "| I-80 | 1 of 2 |" in said and "| delay | 1 | 1 of 1 | 0 of 1 | 1 of 1 | 2.00, 0.50 |" in said
+    assert "| none, I-80 | 1 of 2 |" in said and "| delay | 1 | 1 of 1 | 0 of 1 | 1 of 1 | 2.00, 0.50 |" in said
     assert "| memory | 2 | 0 of 1 | 1 of 1 | 1 of 1 |" in said

@@ -56,7 +56,7 @@ def test_absence_is_a_claim_of_its_own(ladder_: Ladder | None, verdict: Verdict)
     found, refusal = unsure(ladder_, Refusal(Reason.NO_GAIN))
     assert found is verdict and (refusal.reason is Reason.TAILS) == (verdict is Verdict.UNEXPLAINED)
     text = words.beside_noise(found, "IDM", 4.4, 0.1, ladder_)
-    assert "IDM leaves 4.4 m 5 s ahead, 44 times the sensors' noise" in text
+    assert "IDM leaves 4.4 m 5 s ahead, where sensors' noise is 0.1 m" in text
     assert ("Nothing is missing" in text) == (verdict is Verdict.NONE)
     if verdict is Verdict.UNDECIDED:
         assert text.startswith("IDM leaves") and text.endswith("so would an effect of a form that was not tried.")
