@@ -37,7 +37,8 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
 
     An agent that has terminated or been truncated leaves ``agents``, and its vehicle goes back to its driver. Where
     vehicles enter and leave, every trip is an agent of its own, ``vehicle_i_trip_k``: it appears when its vehicle
-    enters, and terminates when that has left. While no agent is there traffic goes on until one is, or the end.
+    enters, and terminates when that has left. While no agent is there traffic goes on until one is, or the end. The ego
+    of ``controlled=1`` is one agent until the end, which observes zeros while it is away.
     With ``fixed`` agents are the slots ``vehicle_i``, there until the end, as TorchRL's ``PettingZooWrapper`` needs.
     The mask ``info["present"]`` says whose vehicle is on the road; others observe zeros, and their actions do nothing.
     Infos then hold numbers alone, and after ``reset`` the same names as after a step.
@@ -70,7 +71,7 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         self.max_cycles = own.limit
         self.render_mode = own.render_mode
         self.batch = Batch(own, 1)
-        self._fixed, self._journeys = fixed, 0 if fixed else self.task.journeys
+        self._fixed, self._journeys = fixed, 0 if fixed or self.task.ego else self.task.journeys
         trips = [f"_trip_{k}" for k in range(1, self._journeys + 1)] or [""]
         self.possible_agents = [f"vehicle_{i}{trip}" for i in self.task.agents for trip in trips]
         self.agents: list[str] = []

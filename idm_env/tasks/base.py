@@ -133,6 +133,8 @@ class Task(abc.ABC):
     """Where numbers may lie: of a kind of task its own, beside those that it inherits."""
     usual_hold: ClassVar[float | None] = None
     """Time (s) for which an action is held where nothing is said; None: one Δt."""
+    ego: ClassVar[bool] = False
+    """Whether the only agent's vehicle leaves, and enters again."""
     first_free: ClassVar[int] = 0
     """Vehicles before this one cannot be controlled: they are recorded."""
     can_draw: ClassVar[tuple[str, ...]] = ()

@@ -212,7 +212,7 @@ class OpenLanesTask(LanesTask):
         return read(self.trips)
 
     @property
-    def ego(self) -> bool:
+    def ego(self) -> bool:  # type: ignore[override]
         """Whether the only agent is one that enters again as soon as it has left: ``controlled=1``."""
         return self.table is None and self.controlled == 1 and isinstance(self.controlled, int)
 
@@ -409,7 +409,6 @@ class OpenLanesTask(LanesTask):
         if self.table is not None:
             return 1
         cycle = min(sum(mean for k, mean in self._slots if k == lane) for lane in self.inflows) / self._busiest
-        cycle = (self.road.length or 0.0) / 100.0 if self.ego else cycle  # nobody drives faster than 100 m/s
         return 2 + math.ceil((self.steps * self.simulator.dt + self.filled / self.entry_speed) / cycle)
 
     @cached_property

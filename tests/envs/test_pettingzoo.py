@@ -74,7 +74,7 @@ def test_seeds():
 @uncompiled
 def test_whoever_seeds_the_first_agents_has_seeded_those_that_begin_later():
     """The official test seeds the spaces of the agents that are there after ``reset``, and samples those of all."""
-    seed_test(lambda: env(task="merge"), num_cycles=30)
+    seed_test(lambda: env(task="merge", controlled=0.1), num_cycles=30)
     made = parallel_env(task="merge", controlled=0.3)
     assert len({id(made.action_space(a)) for a in made.possible_agents}) == 1 < len(made.possible_agents)
 
@@ -152,7 +152,8 @@ def test_fixed_agents_are_there_until_the_end():
 @uncompiled
 def test_agents_of_trips_come_and_go():
     """Every trip is an agent: it appears with its vehicle, and terminates with it, however long none is there."""
-    many = parallel_env(task="merge", vehicles=30, controlled=[2, 9], inflow=2400.0, ramp_inflow=500.0, max_cycles=150)
+    road = {"task": "merge", "vehicles": 30, "controlled": [2, 9], "inflow": 2400.0, "ramp_inflow": 500.0}
+    many = parallel_env(**road, reward="traffic", max_cycles=150)
     seen, _ = many.reset(seed=4)
     at = many.task.bounds.names.index("present")
     began, ended, last = set(many.agents), set(), None

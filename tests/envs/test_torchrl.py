@@ -103,6 +103,19 @@ def test_the_vector_says_its_mode_as_gymnasiums_vectors_do():
     assert vector().autoreset_mode is AutoresetMode.SAME_STEP
 
 
+def test_the_ego_of_an_open_road_is_one_agent_until_the_end():
+    """At the defaults of PettingZoo's face: it leaves and enters again, and is collected all the while."""
+    with backends.off():
+        env = PettingZooWrapper(
+            parallel_env(task="merge", vehicles=30, inflow=2400.0, ramp_inflow=500.0, max_cycles=60)
+        )
+        seen = env.rollout(70, break_when_any_done=False)
+    own = env.unwrapped.task.bounds.names.index("position")
+    place = seen["vehicle", "observation"][:60, 0, own]
+    assert env.unwrapped.possible_agents == ["vehicle_0"] and seen["next", "done"].sum() == 1
+    assert bool((place.diff() < -3.0).any())
+
+
 @pytest.mark.parametrize("use_mask", [False, True])
 def test_fixed_agents_of_an_open_road_are_collected_with_their_mask(use_mask):
     road = {"vehicles": 30, "controlled": [2, 29], "inflow": 2400.0, "ramp_inflow": 500.0, "max_episode_steps": 6}
