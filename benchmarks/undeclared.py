@@ -141,10 +141,10 @@ def generated(job: Job) -> Any:
         synthetic.Platoon = original  # type: ignore[attr-defined]
 
 
-def left_by_noise(job: Job) -> float:
-    """Return what IDM errs in the gap in free simulation (m) on the same drivers, with their noise and no effect.
+def left_by_noise(job: Job) -> dict[str, float]:
+    """Return IDM's errors on the same drivers, with their noise and no effect.
 
-    No right model leaves less of the set with its effect: it is the floor of ``after``.
+    A right model leaves about as much of the set with its effect.
     """
     from idm_env.discovery import crossed
     from idm_env.discovery.discover import prepare
@@ -152,8 +152,7 @@ def left_by_noise(job: Job) -> float:
 
     records = prepare(generated(dataclasses.replace(job, kind="none")), "driver")
     fold = crossed.folds_of(records.runs, (), job.seed)
-    errors = crossed.crossed(records, Hypothesis(), np.zeros((int(fold.max()) + 1, 0)), fold)
-    return errors.summary()["gap_rmse_m"]
+    return crossed.crossed(records, Hypothesis(), np.zeros((int(fold.max()) + 1, 0)), fold).summary()
 
 
 def measure(job: Job, on_progress: object = None) -> dict[str, Any]:
@@ -173,7 +172,8 @@ def measure(job: Job, on_progress: object = None) -> dict[str, Any]:
         "over": [f["where"]["coordinate"] for f in report["found"]],
         "before": before["gap_rmse_m"],
         "after": after["gap_rmse_m"],
-        "noise": left_by_noise(job) if job.kind in KINDS else before["gap_rmse_m"],
+        "ahead_after": after["horizon_rmse_m"],
+        "noise": left_by_noise(job) if job.kind in KINDS else before,
         "ahead": before["horizon_rmse_m"],
         "ahead_floor": floor["horizon_rmse_m"],
         "excluded": [_holds(e) for e in report["excluded"]],
@@ -207,18 +207,22 @@ def shown(rows: list[dict[str, Any]]) -> str:
     for kind in KINDS:
         for ou in (0.0, 0.1):
             sets = by_kind[kind, ou]
-            own = [(r["after"] / r["before"], r["noise"] / r["before"]) for r in sets if over_its_own(r)]
+            own = [
+                (r["after"] / r["before"], r["noise"]["gap_rmse_m"] / r["before"],
+                 r["ahead_after"] / r["ahead"], r["noise"]["horizon_rmse_m"] / r["ahead"])
+                for r in sets if over_its_own(r)
+            ]  # fmt: skip
             lines.append([
                 kind, f"{ou:g}", share([r["verdict"] in ("shape", "unexplained") for r in sets]),
                 share([over_its_own(r) for r in sets]),
-                "{:.2f} ({:.2f})".format(*np.median(own, axis=0)) if own else "–",
+                *("{:.2f} ({:.2f})|{:.2f} ({:.2f})".format(*np.median(own, axis=0)) if own else "–|–").split("|"),
                 share([bool(r["named"]) for r in sets]),
                 share([r["verdict"] == "located" for r in sets]), share([r["verdict"] == "undecided" for r in sets]),
                 share([r["verdict"] == "none" for r in sets]),
                 f"{np.median([r['cpu_s'] for r in sets]):.0f}" if sets else "–",
             ])  # fmt: skip
-    head = ("kind", "OU", "noticed", "over its coordinate", "gap after / before there (noise alone)", "catalogue name",
-            "located", "undecided", "none", "CPU s")  # fmt: skip
+    head = ("kind", "OU", "noticed", "over its coordinate", "gap after / before there (noise alone)",
+            "5 s ahead (noise alone)", "catalogue name", "located", "undecided", "none", "CPU s")  # fmt: skip
     clean = [
         [
             kind, share([bool(r["found"]) or r["verdict"] in ("shape", "located") for r in sets]),
