@@ -209,7 +209,7 @@ MEASURED = {"highway": "2026-11-26"}
 """When tables of skill were measured, where not on 2026-11-27."""
 ROWS = {
     "human": "*Human* is `step(None)`.",
-    "rule": "*Rule* is IDM's formula as commands, its numbers found by a search that sees only returns.",
+    "rule": "*Rule* is IDM's formula as commands, on open roads less a human's, its numbers found by returns alone.",
     "PPO": "*PPO* is the ten lines of README, the last policy of each seed.",
     "APG": "*APG* are gradients through windows of traffic, the last policy of each seed.",
     "oracle": "*Oracle* is the rule with the numbers that are best in each of these episodes.",

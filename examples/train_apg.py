@@ -13,6 +13,7 @@ import torch
 import idm_env  # registers DiffIDM-v0
 
 SEEN = {"features": ["speed", "lead_speed", "gap"], "scaling": "raw"}
+OPEN = ("open_highway", "merge", "bottleneck", "approach")
 RECIPES = {
     # updates, environments, steps of a window, learning rate, (v0, T, s0, a, b, share of the formula) to begin with:
     # about those of the best rule of a search; on open lanes a little faster than drivers, whom nobody exceeds
@@ -31,7 +32,7 @@ RECIPES = {
 SOURCES = {
     "ring": {"reward": "flow", "shock": 0.0, "warmup": 750}, "follow": {"reward": "source"},
     "platoon": {"reward": "quadratic"}, "replay": {"reward": "imitation"}, "replay_lanes": {"reward": "imitation"},
-    **{name: {"reward": "delay"} for name in ("open_highway", "merge", "bottleneck", "approach")},
+    **{name: {"reward": "delay", "controlled": 0.1, "careful": True, "added": False} for name in OPEN},
 }  # fmt: skip
 
 
