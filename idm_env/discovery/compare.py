@@ -176,13 +176,3 @@ def sampling(runs: np.ndarray) -> tuple[list[list[np.ndarray]], int]:
     if len(runs) - len(of_run) >= 2:
         return [[np.array([i]) for i in run] for run in of_run], len(runs) - len(of_run)
     return [[np.array([i]) for i in range(len(runs))]], len(runs) - 1
-
-
-def unit_of(runs: np.ndarray) -> str:
-    """Return in words what is drawn of followers in ``runs`` [F], for a report."""
-    strata, _ = sampling(runs)
-    if len(np.unique(runs)) >= RUNS:
-        return f"{len(strata[0])} whole runs"
-    if len(strata) > 1:
-        return f"{len(runs)} followers within their {len(strata)} runs, which are too few to be drawn themselves"
-    return f"{len(runs)} followers"

@@ -8,7 +8,7 @@ import numpy as np
 
 from idm_env.data import Trajectories, noise_sigma
 from idm_env.discovery import bases, crossed, fleet, judge, result, words
-from idm_env.discovery.compare import DRAWS, Comparison, changes, compare, unit_of
+from idm_env.discovery.compare import RUNS, Comparison, changes, compare
 from idm_env.discovery.judgement import Evaluation, Judgement
 from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.march import CURVE
@@ -22,6 +22,11 @@ from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude
 from idm_env.effects import ALL
 from idm_env.reports.page import versions
 
+INTERVAL = (
+    f"95 % by bootstrap of whole runs, or of followers where fewer than {RUNS} runs are held out; Student's t. "
+    "Better or worse: one of both intervals lies on one side of no change; worse goes before better."
+)
+"""How the intervals of ``helps`` are made."""
 LARGE = 3.0
 """Times the sensors' noise above which errors 5 s ahead are not explained by it."""
 
@@ -84,7 +89,7 @@ def summarise(
         known=_known(final, interval_of(final, problem), base),
         helps=changes(errors),
         ladder=judged.ladder,
-        interval=_how(before) if errors and before is not None else None,
+        interval=INTERVAL if errors else None,
         models=judged.names(),
         error=result.HeldOutErrors(
             test_runs, _drivers(before, after), None if before is None else before.summary(),
@@ -184,17 +189,6 @@ def _strengths(first: Round, problem: Problem) -> dict[str, Strength]:
             if strength is not None:
                 strengths[s.term.effect] = strength
     return strengths
-
-
-def _how(before: judge.Judged) -> str:
-    """Say how the intervals of ``helps`` were made."""
-    count = before.squares["gap_rmse_m"][1]
-    runs = np.array([run for (run, _), n in zip(before.followers, count, strict=True) if n])
-    return (
-        f"95 % by bootstrap of {unit_of(runs)}, {DRAWS} draws: standard error of the logarithm of after / before, "
-        "times Student's t; of the followers' own ratios Student's t. Better or worse: one of both intervals lies on "
-        "one side of no change; worse goes before better."
-    )
 
 
 def _nearest(judged: Judgement, terms: list[result.TermFinding], first: Round) -> result.Nearest | None:

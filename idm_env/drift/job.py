@@ -117,18 +117,20 @@ def sentence(answer: Told) -> str:
         return f"These data cannot tell how drivers drift: {why}."
     if not answer.one_of:
         return "No drift: steady drivers and white noise explain these records as well."
-    titles = {kind.name: f"{kind.title} ({kind.name})" for kind in DRIFTS}
-    rows = {str(row["name"]): row for row in answer.found[answer.one_of[0]].table()}
+    best, kinds = answer.found[answer.one_of[0]], {kind.name: kind for kind in DRIFTS}
+    rows = {str(row["name"]): row for row in best.table()}
     parts = []
-    size = next(p.unit for e in DRIFTS if e.name == answer.one_of[0] for p in e.parameters if p.name == "sigma")
-    for key, symbol, unit in (("sigma", "sigma", "" if size == "1" else f" {size}"), ("memory_time", "tau", " s")):
-        row = rows[f"{answer.one_of[0]}.{key}"]
-        estimate, low, high = (float(row[end]) for end in ("estimate", "low", "high"))
-        interval = f"{low:.3g} to {high:.3g}" if high < UNKNOWN * estimate else "these data do not tell it"
-        parts.append(f"{symbol} {estimate:.3g}{unit} ({interval})")
-    others = ", ".join(titles[n] for n in answer.one_of[1:])
+    for name in best.drivers.drifts:
+        size = next(p.unit for p in kinds[name].parameters if p.name == "sigma")
+        parts.append(f"{kinds[name].title} ({name})")
+        for key, symbol, unit in (("sigma", "sigma", "" if size == "1" else f" {size}"), ("memory_time", "tau", " s")):
+            row = rows[f"{name}.{key}"]
+            estimate, low, high = (float(row[end]) for end in ("estimate", "low", "high"))
+            interval = f"{low:.3g} to {high:.3g}" if high < UNKNOWN * estimate else "these data do not tell it"
+            parts.append(f"{symbol} {estimate:.3g}{unit} ({interval})")
+    others = ", ".join(f"{kinds[n].title} ({n})" for n in answer.one_of[1:])
     apart = f" Not told apart from: {others}." if others else ""
-    return f"Drivers drift: {titles[answer.one_of[0]]}, {', '.join(parts)}.{apart}"
+    return f"Drivers drift: {', '.join(parts)}.{apart}"
 
 
 def _sorts(answer: Told) -> list[dict[str, Any]]:

@@ -23,6 +23,8 @@ FOUND = 10.0
 """Log-likelihood by which drift must beat white noise alone: e^(−10) for two numbers more; steps are not linear."""
 LEAST = 0.1
 """Share of the usual σ below which drift is what smoothing and steps leave, and nobody's."""
+PAIR = ("wander", "accel_noise")
+"""Drifts that are tried together: one forecasts best at 1 s, the other at 10 s."""
 APART = 5.0
 """Log-likelihood by which the best sort must beat another to be told from it."""
 
@@ -59,19 +61,19 @@ def behind_a_record(dt: float, *drifts: Effect) -> Simulator:
 
 @dataclass(frozen=True, eq=False)
 class _Sort:
-    """A sort of drift, or none, to be estimated."""
+    """A sort of drift to be estimated: none, one or several processes at once."""
 
-    kind: Effect | None
+    kinds: tuple[Effect, ...]
     smooth: Batch
     measured: Batch
     noise: tuple[float, float] | None
 
     def __str__(self) -> str:
-        return "no drift" if self.kind is None else self.kind.name
+        return " and ".join(kind.name for kind in self.kinds) or "no drift"
 
     @property
     def simulator(self) -> Simulator:
-        return behind_a_record(self.smooth.dt, *(() if self.kind is None else (self.kind,)))
+        return behind_a_record(self.smooth.dt, *self.kinds)
 
 
 def _estimated(sort: _Sort, progress: OnProgress) -> dict[str, Tensor]:
@@ -91,6 +93,9 @@ def tell(
 ) -> Told:
     """Estimate every sort of drift on episodes, smoothed and as measured, and say which one it is.
 
+    A wandering time gap and noise of the acceleration are tried together, too: two processes are told only where they
+    beat the best single one as that has to beat none.
+
     Args:
         smooth: Drivers behind leaders, smoothed.
         measured: The same as measured.
@@ -101,7 +106,9 @@ def tell(
         on_progress: Called with the name, done, total and the log-likelihood.
     """
     batch, raw = (Batch.stack(x, substeps=1) for x in (smooth, measured))
-    sorts = [_Sort(kind, batch, raw, noise) for kind in (None, *kinds)]
+    both = tuple(kind for name in PAIR for kind in kinds if kind.name == name)
+    each = [(), *((kind,) for kind in kinds), *([both] if len(both) > 1 else [])]
+    sorts = [_Sort(processes, batch, raw, noise) for processes in each]
     stored = {} if store is None else {s: x for s in sorts if (x := store.get(str(s))) is not None}
     missing = [s for s in sorts if s not in stored]
     for place, numbers in (executor or Serial()).map(_estimated, missing):
@@ -111,13 +118,17 @@ def tell(
         on_progress(str(missing[place]), len(stored), len(sorts), float(numbers["log_likelihood"]))
     drivers = (MeasuredDrivers(s.simulator, batch, raw, IDM_NAMES) for s in sorts)
     steady, *others = (Estimate.of_numbers(d, stored[s]) for d, s in zip(drivers, sorts, strict=True))
-    estimates = dict(zip((kind.name for kind in kinds), others, strict=True))
+    estimates = dict(zip(map(str, sorts[1:]), others, strict=True))
     answer = Told(steady, estimates, ())
     order = sorted((n for n in estimates if not estimates[n].why_not), key=lambda name: -answer.gain[name])
     if answer.verdict == "cannot_tell":
         return answer
+    singles = [n for n in order if len(estimates[n].drivers.drifts) == 1]
+    if singles and answer.gain[order[0]] - answer.gain[singles[0]] < FOUND:
+        order = singles
     best = order[0]
     usual_sigma = {kind.name: catalogue((kind,))[f"{kind.name}.sigma"].default for kind in kinds}
-    if answer.gain[best] < FOUND or estimates[best].settings.sigma[0] < LEAST * usual_sigma[best]:
+    least = [LEAST * usual_sigma[name] for name in estimates[best].drivers.drifts]
+    if answer.gain[best] < FOUND or min(estimates[best].settings.sigma - least) < 0.0:
         return answer
     return Told(steady, estimates, tuple(n for n in order if answer.gain[best] - answer.gain[n] < APART))

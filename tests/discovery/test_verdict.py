@@ -225,7 +225,7 @@ def test_a_finding_tells_what_it_does_for_every_error(lag: Discovery, tmp_path: 
         assert told["verdict"] == "better" and told["low"] < told["ratio"] < told["high"] < 1.0
         assert told["before"] == pytest.approx(report["error"]["before"][key])
         assert told["after"] == pytest.approx(report["error"]["after"][key])
-    assert "8 whole runs" in report["interval"]
+    assert "bootstrap of whole runs" in report["interval"]
     paths = write_report(lag, tmp_path)
     assert set(paths) == {"report.json", "report.html", "model.yaml", "model_idm.yaml"}
     assert report["models"]["model.yaml"] == "IDM with response lag"

@@ -17,9 +17,9 @@ pytest.importorskip("numba")
 from idm_env.data import Episode, Trajectories, episodes
 from idm_env.drift import forecast, held_out, kinds
 from idm_env.drift.estimate import Estimate, estimate, usual
-from idm_env.drift.job import _sorts, drift_file, sentence
+from idm_env.drift.job import _sorts, drift_file, model_of, sentence
 from idm_env.drift.kinds import tell
-from idm_env.effects import DRIFTS, IDM, AccelNoise, Brakes, Delay, Effect, Replay, Wander
+from idm_env.effects import DRIFTS, IDM, AccelNoise, Brakes, Delay, Effect, PerceptionNoise, Replay, Wander
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.options import Source
 from idm_env.fitting.problem import IDM_NAMES
@@ -43,12 +43,14 @@ def behind_a_record(*drifts: Effect) -> Simulator:
     return Simulator(Lane(), (IDM(), *drifts, Replay(), Brakes()), dt=DT, integration="midpoint")
 
 
-def driven(drift: Effect, sigma: float, memory_time: float) -> Trajectories:
+def driven(drift: Effect, sigma: float, memory_time: float, *noise: Effect) -> Trajectories:
     """Return drivers of one kind behind leaders who never stop changing their speed, gap and speed with noise."""
-    simulator, random = behind_a_record(drift), np.random.default_rng(1)
+    simulator, random = behind_a_record(drift, *noise), np.random.default_rng(1)
     params = simulator.defaults(dtype=torch.float64)
     params["idm"] |= {n.removeprefix("idm."): torch.tensor(x, dtype=torch.float64) for n, x in TRUE.items()}
     params[drift.name] = {"sigma": torch.tensor(sigma).double(), "memory_time": torch.tensor(memory_time).double()}
+    for effect in noise:
+        params[effect.name] = {"sigma": torch.tensor(0.25).double(), "memory_time": torch.tensor(1.5).double()}
     steps = round(SECONDS / DT)
     time, phase = DT * np.arange(steps + 1)[:, None], random.uniform(0.0, 6.0, (2, DRIVERS))
     lead_speed = 12.0 + 3.0 * np.sin(time / 7.0 + phase[0]) + 2.0 * np.sin(time / 3.1 + phase[1])
@@ -114,6 +116,19 @@ def test_sorts_of_drift_are_told_apart(drift: Effect, sigma: float, verdict: str
     assert told.one_of == ((drift.name,) if sigma else ())
 
 
+def test_two_processes_at_once_are_told_where_both_are_there() -> None:
+    smooth, raw = (x[::3] for x in both(driven(Wander(), 0.3, 12.0, AccelNoise())))
+    told = tell(smooth, raw, (Wander(), AccelNoise()))
+    assert told.one_of == ("wander and accel_noise",) and told.verdict == "named"
+    pair = told.found[told.one_of[0]]
+    assert told.gain[told.one_of[0]] > max(told.gain["wander"], told.gain["accel_noise"]) + kinds.FOUND
+    assert np.all(np.abs(np.log(pair.settings.sigma / [0.3, 0.25])) < 0.6), pair.settings
+    model = model_of(pair)
+    assert [e.name for e in model.effects] == ["idm", "wander", "accel_noise", "brakes"]
+    words = sentence(told)
+    assert "(wander), sigma" in words and "(accel_noise), sigma" in words and words.count("tau") == 2
+
+
 def test_the_model_of_a_file_drifts(tmp_path) -> None:
     """report.json says what drifts, model.yaml has it with every driver's own parameters."""
     file = tmp_path / "made.csv"
@@ -157,7 +172,7 @@ def test_drivers_kept_back_are_foreseen_and_an_interrupted_run_goes_on(
         drift_file(Source(file), out)
     monkeypatch.setattr(kinds, "estimate", lambda *given, **more: estimates.append(None) or estimate(*given, **more))
     resumed = drift_file(Source(file), out, resume=True)
-    assert len(estimates) == 1 + len(DRIFTS) and {**resumed, "command": ""} == {**whole, "command": ""}
+    assert len(estimates) == 2 + len(DRIFTS) and {**resumed, "command": ""} == {**whole, "command": ""}
     assert (out / "model.yaml").read_bytes() == (tmp_path / "whole" / "model.yaml").read_bytes()
 
 
@@ -174,7 +189,7 @@ def test_what_is_not_finite_or_at_a_limit_is_not_estimated(monkeypatch: pytest.M
         assert why in broken.why_not and not right.why_not
         answers = iter((steady, broken, right))
         monkeypatch.setattr(kinds, "estimate", lambda *_, answers=answers, **__: next(answers))
-        told = tell(smooth, raw, (AccelNoise(), Wander()))
+        told = tell(smooth, raw, (PerceptionNoise(), Wander()))
         assert told.one_of == ("wander",), "the other sort stands"
         rows = _sorts(told)
         assert rows[-1]["log_likelihood"] is None and why in rows[-1]["note"] and not rows[0]["note"]
