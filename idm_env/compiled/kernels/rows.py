@@ -429,8 +429,8 @@ class RowFunction:
             form = BINARY.get(name) or COMPARE[name]
             if kwargs.get("alpha", 1) != 1 or (name == "div" and kwargs.get("rounding_mode")):
                 raise Untraceable(f"{name} with alpha")
-            if name == "pow" and not isinstance(args[1], Tensor) and args[1] in (2, 3):
-                form = "({0} * {0})" if args[1] == 2 else "({0} * {0} * {0})"
+            if name == "pow" and not isinstance(args[1], Tensor) and args[1] in (1, 2, 3):
+                form = f"({' * '.join(['{0}'] * int(args[1]))})"
             return self._each(to, shape, lambda cell: form.format(*(self._at(a, cell, kind) for a in args)))
         if name == "where":
             c, y, n = args
