@@ -325,8 +325,9 @@ class RowFunction:
         place = self._place(x) if self._known(x) else None
         if place is None:
             values = self._plain(x)
-            if values.size == 1:
-                return self._number(values.item(), kind)
+            # A table of one number is that number: LLVM makes no vector code of a choice between two arrays.
+            if values.size and values.tobytes() == values.reshape(-1)[:1].tobytes() * values.size:
+                return self._number(values.reshape(-1)[0].item(), kind)
             shape, place = values.shape, self._table(x, values)
         else:
             shape = tuple(x.shape[1:])
