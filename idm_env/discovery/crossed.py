@@ -63,9 +63,13 @@ def _loss(left: np.ndarray) -> float:
 
 
 def crossed(
-    records: Records, model: Hypothesis, values: np.ndarray, fold: np.ndarray, start: np.ndarray | None = None,
+    records: Records,
+    model: Hypothesis,
+    values: np.ndarray,
+    fold: np.ndarray,
+    start: np.ndarray | None = None,
     pooled: bool = False,
-) -> judge.Judged:  # fmt: skip
+) -> judge.Judged:
     """Return a model's errors on all runs, each judged by what the other folds say.
 
     A driver's parameters are fitted to every second block of his time and judged between, then the other way round;

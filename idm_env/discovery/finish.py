@@ -144,9 +144,13 @@ Found = tuple[Evaluation, Decided, Judgement, Solution]
 
 
 def _on_the_best(
-    evaluation: Evaluation, decided: Decided, judgement: Judgement, last: Solution, laws: list[bases.Law],
+    evaluation: Evaluation,
+    decided: Decided,
+    judgement: Judgement,
+    last: Solution,
+    laws: list[bases.Law],
     searched: Searched,
-) -> Found:  # fmt: skip
+) -> Found:
     """Return what is found on the best law where that is another one, if it is better than all that was found before.
 
     It has to hold by the rules of every addition, against its law, and against the law or IDM with what was added. On a
@@ -175,9 +179,13 @@ def _on_the_best(
 
 
 def _saved(
-    trajectories: Trajectories, evaluation: Evaluation, judgement: Judgement, of_laws: Evaluation,
-    drivers: tuple[Solution, Solution, Solution | None], by: str,
-) -> list[SavedModel]:  # fmt: skip
+    trajectories: Trajectories,
+    evaluation: Evaluation,
+    judgement: Judgement,
+    of_laws: Evaluation,
+    drivers: tuple[Solution, Solution, Solution | None],
+    by: str,
+) -> list[SavedModel]:
     """Return the models in the order of ``Judgement.names``."""
     (first, last, of_law), prepared = drivers, evaluation.records
     # Drivers who adapt are calibrated on parts of the held-out runs too.

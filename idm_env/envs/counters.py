@@ -83,7 +83,6 @@ class Counters:
         """Write the line of an interval that is over."""
         count, speeds, above = self._sums[row, i].tolist()
         self._sums[row, i] = 0.0
-        self.tables[row].append({
-            "detector": self.loops[i].name, "begin": first * self._dt, "end": (first + steps) * self._dt,
-            "count": int(count), "speed": speeds / count if count else math.nan, "occupancy": above / steps,
-        })  # fmt: skip
+        line = {"detector": self.loops[i].name, "begin": first * self._dt, "end": (first + steps) * self._dt}
+        line |= {"count": int(count), "speed": speeds / count if count else math.nan, "occupancy": above / steps}
+        self.tables[row].append(line)

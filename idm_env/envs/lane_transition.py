@@ -97,7 +97,7 @@ class Stage:
 
     def through(
         self, still: Mapping[str, Array], rows: Array, own: Mapping[str, int], begins: Sequence[int], on: Array
-    ) -> tuple[Array, Array]:  # fmt: skip
+    ) -> tuple[Array, Array]:
         """Return what falls on blocks before the stage and on ``more``, from what falls on those after it."""
         blocks, pitch, before = self.plan.layout.blocks, self.plan.pitch, on.copy()
         more = np.zeros((len(self.more), self.plan.count), on.dtype)
@@ -151,7 +151,7 @@ class LaneTables(Tables):
         self.decides: Any = None if plan.wishes is None else self._decision(plan.wishes)
 
     def _decision(self, wishes: Any) -> Any:
-        """Return the plan of what drivers wish, and what in it moves: blocks, what is given, and who is led.
+        """Return the operands of the lane-change decision: rows, blocks, inputs, leader masks and compiled phase.
 
         Untraceable for wishes that look at what no plan has.
         """

@@ -20,11 +20,8 @@ from idm_env.validation import nearest, one_of, shown
 OUTPUTS = ("numpy", "torch")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 RENDER_MODES = ("rgb_array", "human", "rgb_array_list")
-INFO = (
-    "accel", "command", "failsafe", "crash", "rewards", "vehicle_id", "lane_changes", "lane_refusals", "present",
-    "queued", "inside", "outflow", "ramp", "standing", "co2", "travel",
-    "stops",
-)  # fmt: skip
+INFO: tuple[str, ...] = ("accel", "command", "failsafe", "crash", "rewards", "vehicle_id", "lane_changes")
+INFO += ("lane_refusals", "present", "queued", "inside", "outflow", "ramp", "standing", "co2", "travel", "stops")
 TENSORS, SPACES, ROW_BYTES = 25, 8, 400
 """Memory of one environment: tensors per vehicle, arrays per observed feature, and bytes besides, as measured."""
 _MODES = {"NextStep": AutoresetMode.NEXT_STEP, "SameStep": AutoresetMode.SAME_STEP, "Disabled": AutoresetMode.DISABLED}

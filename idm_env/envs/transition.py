@@ -48,9 +48,14 @@ class WholeStep:
     """
 
     def __init__(
-        self, moves: Moves, world: EnvState, blocks: Sequence[str], kind: tuple[bool, bool], draws: Sequence[str],
+        self,
+        moves: Moves,
+        world: EnvState,
+        blocks: Sequence[str],
+        kind: tuple[bool, bool],
+        draws: Sequence[str],
         form: Form,
-    ) -> None:  # fmt: skip
+    ) -> None:
         (idle, every), task, like = kind, moves.task, world.state
         self._world, self._blocks, self._draws = world, blocks, tuple(draws)
         size, agents = like.speed.shape[-1], len(task.agents)
@@ -245,7 +250,7 @@ class CompiledTransition:
 
     def __init__(
         self, moves: Moves, world: EnvState, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.moves, self.task, self.world, self.layout = moves, moves.task, world, layout
         self.rows, self.size = world.state.speed.shape
         self.real = np.dtype(np.float32 if world.state.speed.dtype == torch.float32 else np.float64)

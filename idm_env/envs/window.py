@@ -226,10 +226,8 @@ class Tape:
             steps = np.arange(part.start, part.stop, dtype=np.int64)
             bound, decided, (_, normals) = plan.of(values.layout, batch.episode_params()), steps // held, batch.ahead()
             past, clock, now = values.past, self.clocks[done], done // held
-            moment = Moment(
-                clock, self.action[now], self.on_road[now * held], normals, batch.used, past.numbers, past.newest,
-                bound, values.whole, looks=(held - 1 - done) % held,
-            )  # fmt: skip
+            here = clock, self.action[now], self.on_road[now * held], normals, batch.used, past.numbers, past.newest
+            moment = Moment(*here, bound, values.whole, looks=(held - 1 - done) % held)
             self.held_memory += [normals, past.numbers]
             pointers = plan.spread(moment, steps - done) | {"state_step": row_addresses(self.clocks, steps)}
             pointers |= {"live": row_addresses(self.on_road, decided * held)}
@@ -348,10 +346,9 @@ class Tape:
             see |= {n: address(x) for n, x in weights.items()} | {"to_seen": address(looked)}
             see |= {"on_later": address(on_later), "to_hidden": address(recalled)}
             shared = recorded.backward.call, asks, plan.rows, plan.size, held
-            arrays = (
-                first, last - first, self.over[first:last], two, mid, pasts, on_seen, on_last[first:last], on_action,
-                acted, done, on_observation, looked, total, recalled, on_later, remembers, each, parameters,
-            )  # fmt: skip
+            part = first, last - first, self.over[first:last], two, mid, pasts, on_seen, on_last[first:last]
+            policy = on_action, acted, done, on_observation, looked, total, recalled, on_later, remembers
+            arrays = (*part, *policy, each, parameters)
             some = partial(_parts_back, driver.backward, sums, see, (shared, arrays, self._blocks))
             pool.split(some, self._parts, 1, self._threads)
             if len(mid):
@@ -387,12 +384,10 @@ class _Window(torch.autograd.Function):
         ctx.tape, ctx.names, ctx.shapes = tape, names, [x.shape for x in parameters]
         ctx.save_for_backward(blocks, seen, hidden, push, *given)
         ctx.set_materialize_grads(False)
-        return (
-            values.blocks.clone(), None if token is None else token_like(token),
-            torch.from_numpy(tape.seen).view(actions + 1, rows, -1),
-            torch.from_numpy(tape.action).view(actions, rows, -1), torch.from_numpy(tape.reward()),
-            torch.from_numpy(tape.last("observation")), torch.from_numpy(tape.hidden[-1]).view(hidden.shape),
-        )  # fmt: skip
+        seen, action = torch.from_numpy(tape.seen), torch.from_numpy(tape.action).view(actions, rows, -1)
+        reward, last, hidden_last = map(torch.from_numpy, (tape.reward(), tape.last("observation"), tape.hidden[-1]))
+        after = values.blocks.clone(), None if token is None else token_like(token)
+        return (*after, seen.view(actions + 1, rows, -1), action, reward, last, hidden_last.view(hidden.shape))
 
     @staticmethod
     @once_differentiable
@@ -405,12 +400,10 @@ class _Window(torch.autograd.Function):
             return np.zeros(shape, plan.real) if x is None else np.ascontiguousarray(x.numpy()).reshape(shape)
 
         actions, wide, acts = tape.actions, tape.seen.shape[1], tape.action.shape[1]
-        on_now, on_past, on_parameters, acted, sums = tape.back(
-            weights, dense(on[2], actions + 1, wide), dense(on[5], actions, wide), dense(on[3], actions, acts),
-            dense(on[4], actions, plan.rows), dense(on[0], len(blocks), plan.count),
-            dense(on[1], *(plan.past_shape or (plan.rows, 1, 1, 1))),
-            dense(on[6], hidden.numel()),
-        )  # fmt: skip
+        on_steps = dense(on[2], actions + 1, wide), dense(on[5], actions, wide), dense(on[3], actions, acts)
+        on_worlds = dense(on[4], actions, plan.rows), dense(on[0], len(blocks), plan.count)
+        on_ends = dense(on[1], *(plan.past_shape or (plan.rows, 1, 1, 1))), dense(on[6], hidden.numel())
+        on_now, on_past, on_parameters, acted, sums = tape.back(weights, *on_steps, *on_worlds, *on_ends)
         gradients: list[Tensor | None] = [torch.from_numpy(on_now).view(blocks.shape)]
         gradients.append(torch.from_numpy(on_past) if plan.past_shape else None)
         gradients.append(torch.from_numpy(sums["seen"]).view(seen.shape))

@@ -63,7 +63,7 @@ class Moment:
 
 
 class RowTable:
-    """The addresses that loops over rows are called with: what stays, groups of arrays, and what is given by name."""
+    """Argument table of a compiled row function: constant addresses, arrays that change per step, addresses by name."""
 
     def __init__(self, loops: RowFunction, still: Mapping[str, Array], groups: Sequence[Group]) -> None:
         self._stays = loops.table(still)

@@ -29,9 +29,13 @@ class Counts(NamedTuple):
 
 
 def trips(
-    per_hour: Mapping[int, float], seconds: float, *, speed: float = ENTRY_SPEED, slots: int | None = None,
+    per_hour: Mapping[int, float],
+    seconds: float,
+    *,
+    speed: float = ENTRY_SPEED,
+    slots: int | None = None,
     dtype: torch.dtype = torch.float32,
-) -> Trips:  # fmt: skip
+) -> Trips:
     """Return trips that begin evenly in time, so many an hour on each lane, as long as ``seconds``.
 
     Every lane's first trip is due after one interval. Without ``slots`` every trip has a slot of its own; with it,

@@ -132,9 +132,11 @@ def _leaves_a_way(closed: Sequence[tuple[float, ...]], road: Lanes, time: float)
 
 
 def with_classes(
-    values: dict[str, dict[str, Tensor]], kinds: Sequence[str], classes: Mapping[str, DriverClass],
+    values: dict[str, dict[str, Tensor]],
+    kinds: Sequence[str],
+    classes: Mapping[str, DriverClass],
     factors: Mapping[tuple[str, str], Tensor],
-) -> dict[str, dict[str, Tensor]]:  # fmt: skip
+) -> dict[str, dict[str, Tensor]]:
     """Return the parameters in which those of a class have its numbers, times a factor for each vehicle, if any.
 
     ValueError for a parameter that is not there.

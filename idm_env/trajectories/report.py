@@ -28,9 +28,12 @@ MOST_LISTED = 100
 
 
 def write_report(
-    out: Path, report: dict[str, Any], shown: Sequence[tuple[TrackPiece, RegularMotion]], parameters: pl.DataFrame,
+    out: Path,
+    report: dict[str, Any],
+    shown: Sequence[tuple[TrackPiece, RegularMotion]],
+    parameters: pl.DataFrame,
     figures: Sequence[page.Block] = (),
-) -> None:  # fmt: skip
+) -> None:
     """Write ``report.json`` and ``report.html`` with the table of methods, and pictures before and after.
 
     ``figures`` are pictures in space and time.

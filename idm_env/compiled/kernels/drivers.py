@@ -107,9 +107,13 @@ class DriverKernel:
 
 @lru_cache(maxsize=256)
 def _kernel(
-    road: Road, effects: tuple[Effect, ...], dt: float, integration: Integration, form: Form,
+    road: Road,
+    effects: tuple[Effect, ...],
+    dt: float,
+    integration: Integration,
+    form: Form,
     fixed: tuple[tuple[Leaf, float], ...],
-) -> DriverKernel | str:  # fmt: skip
+) -> DriverKernel | str:
     try:
         recording = record(CarFollowingStep(road, effects, dt, integration), form)
         program = DriverProgram(recording, dict(fixed))
@@ -243,8 +247,10 @@ class BehindRecord:
         wide, work = loops.width(self.rows, copies), math.prod(shape) * self.steps
         pool.split(
             lambda begin, end: loop(*arguments, self.rows, copies, wide, self.steps, slots, begin, end),
-            loops.tiles(self.rows, copies), 1, pool.count(work),
-        )  # fmt: skip
+            loops.tiles(self.rows, copies),
+            1,
+            pool.count(work),
+        )
 
     def _given(self, start: Tensor, past: Tensor, statics: Tensor) -> tuple[Array, Array, Array, int]:
         flat = [x.detach().reshape(len(x), -1).contiguous().numpy() for x in (start, past, statics)]
@@ -266,11 +272,9 @@ class BehindRecord:
         kind = np.dtype(self.kind)
         gap, speed = (take((self.steps // every, entries), kind) for _ in range(2))
         tape = take((len(taped), self.steps if len(taped) else 0, entries), kind)
-        self._run(
-            loops.forward, shape, slots, start, past, statics, self._record, self._reads, self.kernel.seen,
-            printed.places, printed.layout, *printed.compiled(self.kind, VALUES), every,
-            gap, speed, tape, taped,
-        )  # fmt: skip
+        seen = start, past, statics, self._record, self._reads, self.kernel.seen
+        plan = printed.places, printed.layout, *printed.compiled(self.kind, VALUES)
+        self._run(loops.forward, shape, slots, *seen, *plan, every, gap, speed, tape, taped)
         return gap, speed, tape
 
     def _backward(
@@ -288,12 +292,10 @@ class BehindRecord:
         moving = [i for i, n in enumerate(program.states) if n in program.moving]
         on_moving = np.zeros((len(moving), entries), kind)
         on_past, on_statics = np.zeros_like(past), np.zeros_like(statics)
-        self._run(
-            loops.adjoint, shape, slots, start, past, statics, self._record, self._reads, self.kernel.seen,
-            printed.places, printed.layout, printed.compiled(self.kind, VALUES)[0],
-            *printed.compiled(self.kind, ADJOINT), every, on_gap, on_speed, tape,
-            self.kernel.taped, on_moving, on_past, on_statics,
-        )  # fmt: skip
+        seen = start, past, statics, self._record, self._reads, self.kernel.seen
+        phases = printed.compiled(self.kind, VALUES)[0], *printed.compiled(self.kind, ADJOINT)
+        operands = printed.places, printed.layout, *phases, every, on_gap, on_speed, tape, self.kernel.taped
+        self._run(loops.adjoint, shape, slots, *seen, *operands, on_moving, on_past, on_statics)
         on_start = np.zeros_like(start)
         on_start[moving] = on_moving
         gradients = [torch.from_numpy(x).view(-1, *shape) for x in (on_start, on_past, on_statics)]
@@ -348,11 +350,9 @@ class BehindRecord:
             along = np.zeros((0, 0, 0), self.kind)
         else:
             along = start_by.detach().reshape(*start_by.shape[:2], -1).contiguous().numpy()
-        arguments = (
-            start, along, past, statics, self._record, self._reads, self.kernel.seen, printed.places, printed.moving,
-            printed.layout, *printed.compiled(self.kind, VALUES + TANGENTS), every,
-        )  # fmt: skip
-        return arguments, slots, shape
+        seen = start, along, past, statics, self._record, self._reads, self.kernel.seen
+        plan = printed.places, printed.moving, printed.layout, *printed.compiled(self.kind, VALUES + TANGENTS)
+        return (*seen, *plan, every), slots, shape
 
     def start_by(self, state: State, values: Mapping[str, Tensor]) -> Tensor | None:
         """Return the derivative of the start by parameters, (names, moving states, …, rows); None where it is 0.

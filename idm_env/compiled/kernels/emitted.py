@@ -31,12 +31,11 @@ with needed("a compiled loop"):
 from idm_env.compiled.kernels.memory import located
 
 _BYTE, _WHOLE = ir.IntType(8), ir.IntType(64)
-_OPERATORS: dict[type[ast.AST], Any] = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
-    ast.FloorDiv: operator.floordiv, ast.Mod: operator.mod, ast.Pow: operator.pow, ast.Lt: operator.lt,
-    ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge, ast.Eq: operator.eq, ast.NotEq: operator.ne,
-    ast.USub: operator.neg, ast.Not: operator.not_, ast.And: operator.and_, ast.Or: operator.or_,
-}  # fmt: skip
+_OPERATORS: dict[type[ast.AST], Any] = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}
+_OPERATORS |= {ast.Div: operator.truediv, ast.FloorDiv: operator.floordiv, ast.Mod: operator.mod, ast.Pow: operator.pow}
+_OPERATORS |= {ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge}
+_OPERATORS |= {ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.USub: operator.neg, ast.Not: operator.not_}
+_OPERATORS |= {ast.And: operator.and_, ast.Or: operator.or_}
 _CONSTANT = re.compile(r"c|t\d+")
 """Names of arrays of constants."""
 _PLAIN = {bool: types.boolean, int: types.int64, float: types.float64}

@@ -398,9 +398,7 @@ def decide(
         if some:
             reordered(order, begin, place, count, ring, winner, granted, fresh_order, fresh_begin)
             relink(fresh_order, fresh_begin, count, ring, base, lane, leader, follower, fresh)
-            count_changes(
-                winner, order, left, right, to_left, begin, ring, base, lane, follower, changed, unjudged
-            )  # fmt: skip
+            count_changes(winner, order, left, right, to_left, begin, ring, base, lane, follower, changed, unjudged)
             copy(order, 0, fresh_order, 0, begin[count])
             copy(begin, 0, fresh_begin, 0, count + 1)
         copy(orders, base, order, 0, n)

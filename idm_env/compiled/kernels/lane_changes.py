@@ -77,18 +77,14 @@ class Deciding:
         mergers = np.tile(np.arange(self._n), self._rows if self._sees else 0)
         order, begin = np.empty(size, np.int64), np.empty(self._rows * (lanes + 1), np.int64)
         choices = Choices(np.zeros(size, np.uint8), mergers, order, begin)
-        done = lane_change_loops.decide(
-            *world, len(world[2]) > 0, *turn, self._n, lanes, float(road.ring or 0.0), road.handed == "left",
-            self._tables, *plan, *wishes.compiled(world[1].dtype.name), len(wishes.slots), *choices[:2], self.turns,
-            *choices[2:],
-        )  # fmt: skip
+        own = self._n, lanes, float(road.ring or 0.0), road.handed == "left", self._tables
+        wish = *wishes.compiled(world[1].dtype.name), len(wishes.slots), *choices[:2]
+        done = lane_change_loops.decide(*world, len(world[2]) > 0, *turn, *own, *plan, *wish, self.turns, *choices[2:])
         return choices if done else None
 
 
-KINDS = {
-    **{name: i + 1 for i, name in enumerate(SEARCHED)},
-    HERE[0]: lane_change_loops.OPENS, HERE[1]: lane_change_loops.CLOSES, HERE[2]: lane_change_loops.STOPS,
-}  # fmt: skip
+KINDS = {**{name: i + 1 for i, name in enumerate(SEARCHED)}, HERE[0]: lane_change_loops.OPENS}
+KINDS |= {HERE[1]: lane_change_loops.CLOSES, HERE[2]: lane_change_loops.STOPS}
 """Rows that are searched for instead of read from an array."""
 
 

@@ -98,8 +98,10 @@ class RolloutPlan:
         )  # fmt: skip
         pool.split(
             lambda begin, end: loop(*common, begin, end),
-            tiles.tiles(self.rows, size, wide, around), 1, pool.count(self.rows * size * steps),
-        )  # fmt: skip
+            tiles.tiles(self.rows, size, wide, around),
+            1,
+            pool.count(self.rows * size * steps),
+        )
 
     def forward(self, first: int, steps: int, *arguments: Any) -> None:
         """Run a block of steps."""

@@ -95,9 +95,12 @@ class PolicyRows(RowFunction):
     simpler, lean = _SIMPLER, False
 
     def __init__(
-        self, function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor], rows: int,
+        self,
+        function: Callable[..., Mapping[str, Tensor]],
+        inputs: Mapping[str, Tensor],
+        rows: int,
         shared: Sequence[str],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._shared = set(shared)
         self._whole: set[int] = set()
         self._read: dict[str, tuple[Tensor, Place]] = {}
@@ -127,11 +130,9 @@ class PolicyRows(RowFunction):
         for name, (x, place) in self._read.items():
             if storage(x) in self._used:
                 to, width = f"{place.array}[U({place.start} + j * {PITCH})]", x.numel() // self._rows
-                loads += [
-                    f"for j in range({width}):", "    for r in range(count):",
-                    f"        {to} = in_{name}[U((first + r) * {width} + j)]",
-                    "    for r in range(count, m):", f"        {to} = 0",
-                ]  # fmt: skip
+                loads += [f"for j in range({width}):", "    for r in range(count):"]
+                loads += [f"        {to} = in_{name}[U((first + r) * {width} + j)]"]
+                loads += ["    for r in range(count, m):", f"        {to} = 0"]
         return loads
 
     def _tell(self, name: str, x: Tensor, kind: str) -> list[str]:
@@ -268,11 +269,9 @@ class PolicyRows(RowFunction):
 
         def lines(cell: list[str]) -> list[str]:
             target = index(own, cell)
-            return [
-                "for r in range(m):", f"    {target} = F(0.0)", f"for k in range({source.shape[-1]}):",
-                "    for r in range(m):", f"        {target} = {target} + {self._at(source, [*cell, 'k'])}",
-                "for r in range(m):", f"    {target} = {target} / {count}",
-            ]  # fmt: skip
+            lines = ["for r in range(m):", f"    {target} = F(0.0)", f"for k in range({source.shape[-1]}):"]
+            lines += ["    for r in range(m):", f"        {target} = {target} + {self._at(source, [*cell, 'k'])}"]
+            return [*lines, "for r in range(m):", f"    {target} = {target} / {count}"]
 
         return loops(shape, lines)
 
@@ -342,8 +341,6 @@ _SHARED = re.compile(r"\b(?:in_\w+|t\d+|c)\[[^\[\]]*\]")
 """An element of what is the same for all rows."""
 
 _ALONG, _SPREAD = ("sum", "mean", "cat"), ("slice_backward", "select_backward")
-_EACH = {
-    *BINARY, *COMPARE, "where", "clamp", "clamp_min", "clamp_max", "clone", "_to_copy", "masked_fill", "mm",
-    "addmm",
-}  # fmt: skip
+_EACH = {*BINARY, *COMPARE, "where", "clamp", "clamp_min", "clamp_max", "clone", "_to_copy", "masked_fill", "mm"}
+_EACH |= {"addmm"}
 """Operations that are told a dimension by its number, and others that all agents may do at once."""

@@ -30,11 +30,10 @@ _LIBRARIES = sys.stdlib_module_names | {"idm_env", "torch", "numpy", "numba"}
 _PLAIN = (int, float, complex, str, bytes, np.generic, type(None), CodeType, BuiltinFunctionType)
 _MOST = 1 << 14
 """Most values to watch, and most numbers of a tensor that are compared one by one."""
-_PARTS: Mapping[Any, Sequence[str]] = {
-    FunctionType: ("__code__", "__defaults__", "__kwdefaults__", "__closure__"), CellType: ("cell_contents",),
-    MethodType: ("__func__", "__self__"), partial: ("func", "args", "keywords"), staticmethod: ("__func__",),
-    classmethod: ("__func__",), property: ("fget",), functools.cached_property: ("func",),
-}  # fmt: skip
+_PARTS: dict[Any, Sequence[str]] = {FunctionType: ("__code__", "__defaults__", "__kwdefaults__", "__closure__")}
+_PARTS |= {CellType: ("cell_contents",), MethodType: ("__func__", "__self__"), partial: ("func", "args", "keywords")}
+_PARTS |= {staticmethod: ("__func__",), classmethod: ("__func__",), property: ("fget",)}
+_PARTS |= {functools.cached_property: ("func",)}
 """What is read of objects of Python's own types."""
 _FIXED = {tuple, frozenset, partial, MethodType}
 """Types of which nobody can change what they hold."""

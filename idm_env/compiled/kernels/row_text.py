@@ -7,25 +7,18 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
-UNARY = {
-    "reciprocal": "(F(1.0) / {0})", "neg": "(-{0})", "abs": "abs({0})", "sqrt": "np.sqrt({0})",
-    "exp": "np.exp({0})", "log1p": "np.log1p({0})",
-    "expm1": "np.expm1({0})", "rsqrt": "(F(1.0) / np.sqrt({0}))", "log": "np.log({0})",
-    "floor": "np.floor({0})", "round": "np.rint({0})", "isinf": "np.isinf({0})", "sin": "np.sin({0})",
-    "cos": "np.cos({0})", "relu": "larger({0}, F(0))", "tanh": "tanh({0})", "logical_not": "(not {0})",
-    "bitwise_not": "(not {0})", "sign": "F(np.sign({0}))", "sgn": "F(np.sign({0}))",
-}  # fmt: skip
-BINARY = {
-    "add": "({0} + {1})", "sub": "({0} - {1})", "rsub": "({1} - {0})", "mul": "({0} * {1})", "div": "({0} / {1})",
-    "minimum": "smaller({0}, {1})", "maximum": "larger({0}, {1})", "pow": "({0} ** {1})",
-    "remainder": "({0} % {1})", "tanh_backward": "({0} * (F(1.0) - {1} * {1}))",
-    "threshold_backward": "({0} if {1} > F(0) else F(0))", "bitwise_and": "({0} and {1})",
-    "bitwise_or": "({0} or {1})", "logical_and": "({0} and {1})", "logical_or": "({0} or {1})",
-}  # fmt: skip
-COMPARE = {
-    "lt": "({0} < {1})", "le": "({0} <= {1})", "gt": "({0} > {1})", "ge": "({0} >= {1})", "eq": "({0} == {1})",
-    "ne": "({0} != {1})",
-}  # fmt: skip
+UNARY = {"reciprocal": "(F(1.0) / {0})", "neg": "(-{0})", "abs": "abs({0})", "sqrt": "np.sqrt({0})"}
+UNARY |= {"exp": "np.exp({0})", "log1p": "np.log1p({0})", "expm1": "np.expm1({0})", "rsqrt": "(F(1.0) / np.sqrt({0}))"}
+UNARY |= {"log": "np.log({0})", "floor": "np.floor({0})", "round": "np.rint({0})", "isinf": "np.isinf({0})"}
+UNARY |= {"sin": "np.sin({0})", "cos": "np.cos({0})", "relu": "larger({0}, F(0))", "tanh": "tanh({0})"}
+UNARY |= {"logical_not": "(not {0})", "bitwise_not": "(not {0})", "sign": "F(np.sign({0}))", "sgn": "F(np.sign({0}))"}
+BINARY = {"add": "({0} + {1})", "sub": "({0} - {1})", "rsub": "({1} - {0})", "mul": "({0} * {1})", "div": "({0} / {1})"}
+BINARY |= {"minimum": "smaller({0}, {1})", "maximum": "larger({0}, {1})", "pow": "({0} ** {1})"}
+BINARY |= {"remainder": "({0} % {1})", "tanh_backward": "({0} * (F(1.0) - {1} * {1}))"}
+BINARY |= {"threshold_backward": "({0} if {1} > F(0) else F(0))", "bitwise_and": "({0} and {1})"}
+BINARY |= {"bitwise_or": "({0} or {1})", "logical_and": "({0} and {1})", "logical_or": "({0} or {1})"}
+COMPARE = {"lt": "({0} < {1})", "le": "({0} <= {1})", "gt": "({0} > {1})", "ge": "({0} >= {1})", "eq": "({0} == {1})"}
+COMPARE |= {"ne": "({0} != {1})"}
 REDUCE = {
     "sum": ("0", "{0} + {1}", "{0}"),
     "mean": ("0", "{0} + {1}", "{0} / {1}"),

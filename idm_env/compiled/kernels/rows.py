@@ -31,10 +31,8 @@ _TEXT = {"f": "F", "d": "np.float64", "i": "np.int64", "b": "np.bool_"}
 KINDS = {torch.float32: "f", torch.float64: "f", torch.int64: "i", torch.bool: "b"}
 TYPES = {"d": np.dtype(np.float64), "i": np.dtype(np.int64), "b": np.dtype(np.bool_)}
 """Types of numbers beside those of the recording; ``d`` are doubles in a recording in single precision."""
-_BLANK = {
-    "new_zeros": 0.0, "zeros_like": 0.0, "zeros": 0.0, "new_ones": 1.0, "ones_like": 1.0, "empty_like": 0.0,
-    "new_empty_strided": 0.0,
-}  # fmt: skip
+_BLANK = {"new_zeros": 0.0, "zeros_like": 0.0, "zeros": 0.0, "new_ones": 1.0, "ones_like": 1.0, "empty_like": 0.0}
+_BLANK |= {"new_empty_strided": 0.0}
 _FULL = {"new_full": 2, "full_like": 1, "full": 1, "fill_": 1}
 """Constants of one value, which backward passes write to: the value, or the place of the argument that it is."""
 
@@ -91,9 +89,10 @@ class _Recorder(Uncompiled, TorchDispatchMode):
 
 
 def recorded(
-    function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor],
+    function: Callable[..., Mapping[str, Tensor]],
+    inputs: Mapping[str, Tensor],
     simpler: Mapping[Any, Callable[..., Any]],
-) -> tuple[list[tuple[str, tuple[Any, ...], dict[str, Any], Any]], dict[str, Tensor]]:  # fmt: skip
+) -> tuple[list[tuple[str, tuple[Any, ...], dict[str, Any], Any]], dict[str, Tensor]]:
     """Return the operations of one call of a function of tensors of any shape, and its result.
 
     Raises:
@@ -436,9 +435,10 @@ class RowFunction:
         if name == "where":
             c, y, n = args
             return self._each(
-                to, shape,
+                to,
+                shape,
                 lambda cell: f"{self._at(y, cell, to.kind)} if {self._at(c, cell)} else {self._at(n, cell, to.kind)}",
-            )  # fmt: skip
+            )
         if name in ("clamp", "clamp_min", "clamp_max"):
             return self._clamp(name, args, kwargs, shape, to)
         if name in REDUCE:
@@ -468,9 +468,7 @@ class RowFunction:
         raise Untraceable(f"operation {name}")
 
     def _common(self, args: Sequence[Any]) -> str:
-        kinds = [
-            self._kind(a) if isinstance(a, Tensor) else "f" if isinstance(a, float) else "i" for a in args
-        ]  # fmt: skip
+        kinds = [self._kind(a) if isinstance(a, Tensor) else "f" if isinstance(a, float) else "i" for a in args]
         return next(kind for kind in "dfib" if kind in kinds)
 
     def _clamp(
@@ -501,9 +499,11 @@ class RowFunction:
 
         def line(cell: list[str]) -> list[str]:
             own = iter(cell)
-            full = [f"k{d}" if d in gone else next(own) for d in range(1, source.dim())] if not keeps_dim else [
-                f"k{d}" if d in gone else cell[d - 1] for d in range(1, source.dim())
-            ]  # fmt: skip
+            full = (
+                [f"k{d}" if d in gone else next(own) for d in range(1, source.dim())]
+                if not keeps_dim
+                else [f"k{d}" if d in gone else cell[d - 1] for d in range(1, source.dim())]
+            )
             element = self._at(source, full, "b" if to.kind == "b" else to.kind)
             start = first or self._at(source, ["0" if i.startswith("k") else i for i in full])
             lines = [f"s = {start if start != '0' or to.kind != 'f' else 'F(0.0)'}"]
@@ -541,10 +541,8 @@ class RowFunction:
 
         def line(cell: list[str]) -> list[str]:
             every = [*cell, "k"]
-            return [
-                f"s = {self._number(0, to.kind)}", f"for k in range({x.shape[-1]}):",
-                f"    s = s + {self._at(args[0], every, to.kind)}", f"    {index(to, every)} = s",
-            ]  # fmt: skip
+            lines = [f"s = {self._number(0, to.kind)}", f"for k in range({x.shape[-1]}):"]
+            return [*lines, f"    s = s + {self._at(args[0], every, to.kind)}", f"    {index(to, every)} = s"]
 
         return self._loops(x.shape[1:-1], line)
 
@@ -604,7 +602,7 @@ class RowFunction:
 
     def _scattered(
         self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], shape: tuple[int, ...], to: Place
-    ) -> list[str]:  # fmt: skip
+    ) -> list[str]:
         """Print ``x.scatter(dim, which, source)``, or with what was there added to it, or the larger or smaller one."""
         x, dim, which, source = args[:4]
         along = dim % x.dim() - 1
@@ -630,10 +628,9 @@ class RowFunction:
         def line(cell: list[str]) -> list[str]:
             kind = self._common(args)
             before = form.format(self._at(keys, [*cell[:-1], "k"], kind), self._at(values, cell, kind))
-            return [
-                "n = 0", f"h = {keys.shape[-1]}", "while n < h:", "    k = (n + h) // 2",
-                f"    n = k + 1 if {before} else n", f"    h = h if {before} else k", f"{index(to, cell)} = n",
-            ]  # fmt: skip
+            lines = ["n = 0", f"h = {keys.shape[-1]}", "while n < h:", "    k = (n + h) // 2"]
+            lines += [f"    n = k + 1 if {before} else n", f"    h = h if {before} else k"]
+            return [*lines, f"{index(to, cell)} = n"]
 
         return self._loops(x.shape[1:], line)
 
@@ -650,12 +647,10 @@ class RowFunction:
                 return index(to, [*cell, k])
 
             def insert(j: str, k: str) -> list[str]:
-                return [
-                    f"s = {self._at(x, [*cell, j])}", f"k = {k}", f"while k > 0 and s < {put(first, '(k - 1)')}:",
-                    f"    {put(first, 'k')} = {put(first, '(k - 1)')}",
-                    f"    {put(second, 'k')} = {put(second, '(k - 1)')}", "    k -= 1",
-                    f"{put(first, 'k')} = s", f"{put(second, 'k')} = {j}",
-                ]  # fmt: skip
+                lines = [f"s = {self._at(x, [*cell, j])}", f"k = {k}"]
+                lines += [f"while k > 0 and s < {put(first, '(k - 1)')}:"]
+                lines += [f"    {put(each, 'k')} = {put(each, '(k - 1)')}" for each in (first, second)]
+                return [*lines, "    k -= 1", f"{put(first, 'k')} = s", f"{put(second, 'k')} = {j}"]
 
             def deeper(lines: list[str], by: int) -> list[str]:
                 return ["    " * by + x for x in lines]
@@ -663,12 +658,10 @@ class RowFunction:
             # Hardly any belongs to the first: many are compared at once, and looked at only where one does.
             sooner = f"{self._at(x, [*cell, 'j'])} < {put(first, str(most - 1))}"
             some = f"for j in range(h, min(h + {_AT_ONCE}, {count})):"
-            return [
-                f"for j in range({most}):", *deeper(insert("j", "j"), 1),
-                f"for h in range({most}, {count}, {_AT_ONCE}):", "    n = 0", f"    {some}",
-                f"        n = n + np.int64({sooner})", "    if n > 0:", f"        {some}", f"            if {sooner}:",
-                *deeper(insert("j", str(most - 1)), 4),
-            ]  # fmt: skip
+            lines = [f"for j in range({most}):", *deeper(insert("j", "j"), 1)]
+            lines += [f"for h in range({most}, {count}, {_AT_ONCE}):", "    n = 0", f"    {some}"]
+            lines += [f"        n = n + np.int64({sooner})", "    if n > 0:", f"        {some}"]
+            return [*lines, f"            if {sooner}:", *deeper(insert("j", str(most - 1)), 4)]
 
         return self._loops(x.shape[1:-1], line)
 
@@ -689,9 +682,10 @@ class RowFunction:
             if dim < 0 or self._known(args[2]):
                 raise Untraceable("index_select of rows")
             return self._each(
-                to, x.shape[1:],
+                to,
+                x.shape[1:],
                 lambda cell: self._at(source, [self._at(args[2], [j]) if k == dim else j for k, j in enumerate(cell)]),
-            )  # fmt: skip
+            )
         parts = args[1]
         if self._known(source) or any(p is None for p in parts) or len({p.dim() for p in parts}) > 1:
             raise Untraceable("an index into what changes")

@@ -17,9 +17,12 @@ from idm_env.compiled.scalar.record import Untraceable
 
 
 def digest(
-    function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor],
-    simpler: Mapping[Any, Callable[..., Any]], *, gradients: bool = False,
-) -> bytes:  # fmt: skip
+    function: Callable[..., Mapping[str, Tensor]],
+    inputs: Mapping[str, Tensor],
+    simpler: Mapping[Any, Callable[..., Any]],
+    *,
+    gradients: bool = False,
+) -> bytes:
     """Return the digest (16 bytes) of the operations of ``function(**inputs)``, and of every constant that it reads.
 
     ``inputs`` are tensors of any shape by name; ``simpler`` replaces operations, as in ``RowFunction``.

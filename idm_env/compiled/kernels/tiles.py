@@ -79,7 +79,7 @@ def place(tile, rows, size, wide, around, is_ring):
 
 @exact
 def look_ahead(w, to, source, n, size, is_ring):
-    """Fill row ``to`` with each leader's value; whoever has no leader gets what he will not read."""
+    """Copy each leader's value to row ``to``; entries without a leader are undefined (masked by ``led``)."""
     w[to] = w[source]
     copy(w, to + 1, w, source, n - 1)
     if is_ring and n >= size:

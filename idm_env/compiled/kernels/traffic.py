@@ -142,7 +142,7 @@ class Traffic:
         return seen_merging(view, state, torch.from_numpy(choices.merger).view(self.shape), due)
 
     def _plan(self, kernel: Decision, state: State, inputs: Inputs, params: Params) -> tuple[Array, Array, list[Array]]:
-        """Return what rows are filled with, whose numbers these are, and the arrays that the plan points to.
+        """Return source and strides of each workspace row, its vehicle, and the arrays to keep alive.
 
         What does not change in a rollout is looked up once.
         """

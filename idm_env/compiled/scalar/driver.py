@@ -191,8 +191,8 @@ class DriverProgram:
     def _adjoint(self, nodes: Mapping[str, Node]) -> dict[str, Node]:
         seeds = [self.graph.input(f"on {name}", level=DYNAMIC) for name in nodes]
         parts = adjoint(self.graph, list(nodes.values()), seeds)
-        return {leaf.label.name: g for leaf, g in parts.items() if isinstance(leaf.label, Leaf) and not leaf.label.shift
-                and self._flows(leaf.label.name)}  # fmt: skip
+        own = {leaf.label: g for leaf, g in parts.items() if isinstance(leaf.label, Leaf) and not leaf.label.shift}
+        return {label.name: g for label, g in own.items() if self._flows(label.name)}
 
     def respond_back(self) -> dict[str, Node]:
         """Return what falls on states, parameters, hoisted rows and the past from the states after a step."""

@@ -100,8 +100,9 @@ def _apply(name: str, args: Any, kwargs: dict[str, Any]) -> Scalar:
     elif not kind.is_floating_point:
         raise _refused(graph, f"torch.{plain} to {kind}")
     args = [x for x in args if not isinstance(x, torch.dtype)]
-    keywords = {k: _node(graph, v) if isinstance(v, (Scalar, torch.Tensor)) else v for k, v in kwargs.items()
-             if k not in ("dtype", "device", "out") and not (k == "inplace" and v is False)}  # fmt: skip
+    numbers = {k: v for k, v in kwargs.items() if k not in ("dtype", "device", "out")}
+    numbers = {k: v for k, v in numbers.items() if not (k == "inplace" and v is False)}
+    keywords = {k: _node(graph, v) if isinstance(v, (Scalar, torch.Tensor)) else v for k, v in numbers.items()}
     try:
         return Scalar(graph, FUNCTIONS[plain](graph, *(_node(graph, a) for a in args), **keywords))
     except TypeError as error:
@@ -221,23 +222,18 @@ def _norm_pow(graph: Graph, a: Node, b: Any = None, exponent: Any = None) -> Nod
     return graph.pow(a, _number(graph, exponent if b is None else b))
 
 
+_ONE: tuple[str, ...] = ("abs", "cos", "detach", "exp", "expm1", "floor", "log", "log1p", "relu", "sigmoid", "sign")
+_ONE += ("sin", "sqrt", "tanh")
+_TWO: dict[str, Callable[..., Node]] = {"add": _add, "sub": _sub, "mul": Graph.mul, "div": Graph.div}
 FUNCTIONS: dict[str, Rule] = {
-    **{op: _one(op) for op in (
-        "abs", "cos", "detach", "exp", "expm1", "floor", "log", "log1p", "relu", "sigmoid", "sign", "sin", "sqrt",
-        "tanh",
-    )},
+    **{op: _one(op) for op in _ONE},
     **{op: _comparison(op) for op in ("gt", "ge", "lt", "le", "eq", "ne")},
     **{op: _joined(op) for op in ("and", "or")},
-    "add": _arithmetic(_add),
-    "sub": _arithmetic(_sub),
-    "mul": _arithmetic(Graph.mul),
-    "div": _arithmetic(Graph.div),
+    **{op: _arithmetic(rule) for op, rule in _TWO.items()},
     "remainder": _arithmetic(_remainder),
     "pow": _norm_pow,
     "rpow": lambda graph, a, b: graph.pow(b, a),
-    **{f"r{op}": _arithmetic(_reversed(rule)) for op, rule in (
-        ("add", _add), ("sub", _sub), ("mul", Graph.mul), ("div", Graph.div),
-    )},
+    **{f"r{op}": _arithmetic(_reversed(rule)) for op, rule in _TWO.items()},
     "neg": Graph.neg,
     "square": lambda graph, a: graph.mul(a, a),
     "reciprocal": lambda graph, a: graph.div(graph.constant(1.0), a),
@@ -259,18 +255,14 @@ FUNCTIONS: dict[str, Rule] = {
     **dict.fromkeys(
         ("expand", "expand_as", "to", "type_as", "contiguous", "clone", "float", "double", "broadcast_to"), _same
     ),
-}  # fmt: skip
+}
 """Torch function or method → how its nodes are made. Methods and operators have the same names."""
-FUNCTIONS |= {
-    other: FUNCTIONS[name]
-    for name, others in {
-        "abs": ("absolute",), "neg": ("negative",), "sub": ("subtract",), "mul": ("multiply",),
-        "div": ("divide", "true_divide", "truediv"), "rdiv": ("rtruediv",), "remainder": ("mod",), "clamp": ("clip",),
-        "gt": ("greater",), "lt": ("less",), "and": ("logical_and", "rand"), "or": ("logical_or", "ror"),
-        "invert": ("logical_not", "bitwise_not"),
-    }.items()
-    for other in others
-}  # fmt: skip
+_OTHERS: dict[str, tuple[str, ...]] = {"abs": ("absolute",), "neg": ("negative",), "sub": ("subtract",)}
+_OTHERS |= {"mul": ("multiply",), "clamp": ("clip",)}
+_OTHERS |= {"div": ("divide", "true_divide", "truediv"), "rdiv": ("rtruediv",), "remainder": ("mod",)}
+_OTHERS |= {"gt": ("greater",), "lt": ("less",), "and": ("logical_and", "rand"), "or": ("logical_or", "ror")}
+_OTHERS |= {"invert": ("logical_not", "bitwise_not")}
+FUNCTIONS |= {other: FUNCTIONS[name] for name, others in _OTHERS.items() for other in others}
 
 
 def _operator(name: str, symbol: str) -> None:
@@ -282,8 +274,9 @@ def _operator(name: str, symbol: str) -> None:
     setattr(Scalar, f"__{symbol}__", method)
 
 
-for _symbol in ("add", "radd", "sub", "rsub", "mul", "rmul", "truediv", "rtruediv", "mod", "pow", "rpow", "neg", "abs",
-                "gt", "ge", "lt", "le", "eq", "ne", "and", "or", "rand", "ror", "invert"):  # fmt: skip
+_ARITHMETIC = ("add", "radd", "sub", "rsub", "mul", "rmul", "truediv", "rtruediv", "mod", "pow", "rpow", "neg", "abs")
+_LOGIC = ("gt", "ge", "lt", "le", "eq", "ne", "and", "or", "rand", "ror", "invert")
+for _symbol in (*_ARITHMETIC, *_LOGIC):
     _operator(_symbol, _symbol)
 
 

@@ -52,18 +52,16 @@ def row(slot: Leaf) -> str:
     return word(slot).upper()
 
 
-_FORMS: dict[str, str] = {
-    "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}", "pow": "{0} ** {1}",
-    "abs": "abs({0})", "sqrt": "np.sqrt({0})", "exp": "exp({0})", "expm1": "np.expm1({0})", "log": "np.log({0})",
-    "log1p": "log1p({0})", "tanh": "tanh({0})", "sin": "np.sin({0})", "cos": "np.cos({0})",
-    "floor": "np.floor({0})", "detach": "{0}", "sigmoid": "sigmoid({0})",
-    "relu": "{zero} if {0} < {zero} else {0}", "clamp_min": "{1} if {0} < {1} else {0}",
-    "clamp_max": "{1} if {0} > {1} else {0}", "maximum": "{0} if {0} > {1} else {1}",
-    "minimum": "{0} if {0} < {1} else {1}", "select": "{1} if {0} else {2}",
-    "sign": "{one} if {0} > {zero} else (-{one} if {0} < {zero} else {zero})",
-    "gt": "{0} > {1}", "ge": "{0} >= {1}", "lt": "{0} < {1}", "le": "{0} <= {1}", "eq": "{0} == {1}",
-    "ne": "{0} != {1}", "and": "{0} and {1}", "or": "{0} or {1}", "not": "not {0}",
-}  # fmt: skip
+_FORMS: dict[str, str] = {"add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}"}
+_FORMS |= {"pow": "{0} ** {1}", "abs": "abs({0})", "sqrt": "np.sqrt({0})", "exp": "exp({0})", "expm1": "np.expm1({0})"}
+_FORMS |= {"log": "np.log({0})", "log1p": "log1p({0})", "tanh": "tanh({0})", "sin": "np.sin({0})", "cos": "np.cos({0})"}
+_FORMS |= {"floor": "np.floor({0})", "detach": "{0}", "sigmoid": "sigmoid({0})"}
+_FORMS |= {"relu": "{zero} if {0} < {zero} else {0}", "clamp_min": "{1} if {0} < {1} else {0}"}
+_FORMS |= {"clamp_max": "{1} if {0} > {1} else {0}", "maximum": "{0} if {0} > {1} else {1}"}
+_FORMS |= {"minimum": "{0} if {0} < {1} else {1}", "select": "{1} if {0} else {2}"}
+_FORMS |= {"sign": "{one} if {0} > {zero} else (-{one} if {0} < {zero} else {zero})", "gt": "{0} > {1}"}
+_FORMS |= {"ge": "{0} >= {1}", "lt": "{0} < {1}", "le": "{0} <= {1}", "eq": "{0} == {1}", "ne": "{0} != {1}"}
+_FORMS |= {"and": "{0} and {1}", "or": "{0} or {1}", "not": "not {0}"}
 """Operation → Python text; every argument is a name, save truth values, which stand where they are used."""
 
 Read = Callable[[Leaf], str]

@@ -11,14 +11,12 @@ from idm_env.compiled.scalar.graph import DYNAMIC, Leaf, Node, TimeStep
 from idm_env.compiled.scalar.regions import Regions
 from idm_env.compiled.scalar.source import _FORMS, Constants
 
-_STAGED = _FORMS | {
-    "relu": "choose({0} < 0.0, 0.0, {0})", "clamp_min": "choose({0} < {1}, {1}, {0})",
-    "clamp_max": "choose({0} > {1}, {1}, {0})", "maximum": "choose({0} > {1}, {0}, {1})",
-    "minimum": "choose({0} < {1}, {0}, {1})", "select": "choose({0}, {1}, {2})",
-    "sign": "choose({0} > 0.0, 1.0, choose({0} < 0.0, -1.0, 0.0))",
-    "and": "{0} & {1}", "or": "{0} | {1}", "not": "negated({0})",
-    **{name: f"{name}({{0}})" for name in ("sqrt", "expm1", "log", "log1p", "tanh", "sin", "cos", "floor")},
-}  # fmt: skip
+_STAGED = {**_FORMS, "relu": "choose({0} < 0.0, 0.0, {0})", "clamp_min": "choose({0} < {1}, {1}, {0})"}
+_STAGED |= {"clamp_max": "choose({0} > {1}, {1}, {0})", "maximum": "choose({0} > {1}, {0}, {1})"}
+_STAGED |= {"minimum": "choose({0} < {1}, {0}, {1})", "select": "choose({0}, {1}, {2})"}
+_STAGED |= {"sign": "choose({0} > 0.0, 1.0, choose({0} < 0.0, -1.0, 0.0))", "and": "{0} & {1}", "or": "{0} | {1}"}
+_STAGED |= {"not": "negated({0})"}
+_STAGED |= {**{name: f"{name}({{0}})" for name in ("sqrt", "expm1", "log", "log1p", "tanh", "sin", "cos", "floor")}}
 """Operation → text for ``kernels.staged``: functions where Python itself would ask for truth."""
 
 Read = Callable[[Leaf], str]

@@ -68,10 +68,8 @@ class _Sides(SeenRoad, Sideways):
         exists = lane > 0
         for places in ((self.read("here opens"), self.read("here closes")), (opens, closes)):
             exists = exists & is_open_beside(state.position, state.length, *places)
-        return self.look(
-            state, exists, Where(name, 1), Where(name, 0), ahead > 0, behind > 0, to_leader, to_follower,
-            stops - state.position,
-        )  # fmt: skip
+        around = Where(name, 1), Where(name, 0), ahead > 0, behind > 0, to_leader, to_follower
+        return self.look(state, exists, *around, stops - state.position)
 
 
 def _or_nan(sides: tuple[Side, Side], wish: Wish, blocked: Any) -> Any:
