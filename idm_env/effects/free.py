@@ -141,7 +141,7 @@ def next_history(held: Mapping[str, Tensor], dt: float, now: Now) -> dict[str, A
 
 def change_of(scene: Scene) -> Tensor:
     """Return the leader's speed less that of ``AGO_S`` ago (m/s), shape ``(…, vehicles)``."""
-    return scene.leader.speed - scene.past(0.0 * scene.speed + AGO_S).leader.speed
+    return scene.leader.speed - scene.past(torch.full_like(scene.speed, AGO_S)).leader.speed
 
 
 class OverFeature:
