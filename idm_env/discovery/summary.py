@@ -155,7 +155,7 @@ def _verdict(
         bool(added), any(f.effect for f in added), refusal, structured or unnamed > 0.0, first.left, power,
         judged.shared is not None, apart=not others,
         in_a_state=all(f.where.coordinate in (*STATES, "state", "period") for f in added),
-        exact=judged.is_exact(least),
+        exact=judged.is_exact(least), alike=ladder is not None and ladder.agrees,
     )  # fmt: skip
     if verdict is Verdict.NONE and refusal is not None:
         small = judged.is_exact(least) or refusal.reason is Reason.SMALL_SIZE

@@ -84,7 +84,7 @@ def mean_ratio(errors: Mapping[str, Comparison]) -> float:
 
 def conclude(
     added: bool, named: bool, refusal: Refusal | None, structured: bool, left: np.ndarray, power: bool = True,
-    shared: bool = False, apart: bool = True, in_a_state: bool = False, exact: bool = False,
+    shared: bool = False, apart: bool = True, in_a_state: bool = False, exact: bool = False, alike: bool = False,
 ) -> Verdict:  # fmt: skip
     """Return the verdict.
 
@@ -99,6 +99,8 @@ def conclude(
         apart: Whether no other effect of the catalogue did about as well as one that was added.
         in_a_state: Whether all that was added acts in a state of the driver, and nothing at a place or a time.
         exact: Whether the model's errors are too small for anything to be missing.
+        alike: Whether noise of drivers looks like the errors in every test: where there is much of it, it leaves more
+            than ``LEFT``.
     """
     if exact:
         return Verdict.NONE
@@ -114,5 +116,5 @@ def conclude(
         return Verdict.CANNOT_TELL
     error = left.std(ddof=1) / np.sqrt(len(left)) if len(left) > 1 else np.inf
     if structured or left.mean() > max(LEFT, 3.0 * error):
-        return Verdict.UNEXPLAINED
+        return Verdict.UNDECIDED if alike and not structured else Verdict.UNEXPLAINED
     return Verdict.NONE if power else Verdict.CANNOT_TELL

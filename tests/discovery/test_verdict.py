@@ -124,6 +124,9 @@ def test_the_verdict_is_made_from_what_was_added_and_why_not_more() -> None:
     assert conclude(False, False, Refusal(Reason.FEW_RUNS, 3), True, steep) is Verdict.CANNOT_TELL
     assert conclude(False, False, Refusal(Reason.NO_GAIN), False, flat) is Verdict.NONE
     assert conclude(False, False, Refusal(Reason.NO_GAIN), False, steep) is Verdict.UNEXPLAINED
+    # Much noise of drivers leaves much to a smooth function of the state; it leaves nothing to a candidate.
+    assert conclude(False, False, Refusal(Reason.NO_GAIN), False, steep, alike=True) is Verdict.UNDECIDED
+    assert conclude(False, False, Refusal(Reason.NO_GAIN), True, steep, alike=True) is Verdict.UNEXPLAINED
     assert conclude(False, False, Refusal(Reason.HELD_OUT), True, flat) is Verdict.UNEXPLAINED
     assert conclude(False, False, Refusal(Reason.LAW), False, flat, shared=True) is Verdict.UNEXPLAINED
 
