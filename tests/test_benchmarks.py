@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 
-from benchmarks import command, kept_rows, lane_search, lane_tasks, lanes, named_rows
+from benchmarks import command, kept_rows, lane_planner, lane_search, lane_tasks, lanes, named_rows
 from idm_env.jobs.progress import OnProgress
 from idm_env.jobs.workers import Workers
 from idm_env.tasks import make_task
@@ -146,3 +146,27 @@ def test_a_search_keeps_what_is_best_on_other_episodes(monkeypatch):
     given = {"task": "bottleneck", "inflow": 720.0, "vehicles": 24, "controlled": 0.5}
     best = lane_tasks.searched(given, torch.tensor([-1.0, 1.0, 0.0, -0.5, -2.0]), lane_tasks.constants)
     assert best.tolist() == [1.0]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_a_planner_foresees_what_happens_but_for_noise(noise, monkeypatch):
+    monkeypatch.setattr(lane_planner, "AHEAD", 4)
+    batch = lane_planner.episodes_of("merge 3000 + 800", noise, [7, 8])
+    copies = lane_planner.episodes_of("merge 3000 + 800", noise, range(2 * 5 * 2))
+    lane_planner.drive(batch, torch.tensor([0, 1]), 3)
+    foreseen = lane_planner.foresee(batch, copies, lane_planner.OTHER_NOISE)
+    assert torch.equal(foreseen, lane_planner.foresee(batch, copies, lane_planner.OTHER_NOISE))
+    happens, _ = lane_planner.drive(batch, torch.tensor([0, 3]), 4)
+    assert torch.equal(foreseen[[0, 1], [0, 3]], happens) == (noise == 0.0)
+    assert bool((foreseen[:, 0] > foreseen[:, 3]).all())  # at first to hold agents back costs
+
+
+def test_a_planner_that_must_save_more_commands_less_and_each_row_is_of_the_same_episodes(monkeypatch):
+    for name, value in {"SECONDS": 8, "EVERY": 4, "AHEAD": 4, "WORTH": 1e6}.items():
+        monkeypatch.setattr(lane_planner, name, value)
+    monkeypatch.setattr(lane_planner, "RULES", (lane_planner.RULES[3], lane_planner.RULES[0]))
+    rows = lane_planner.rows_of("merge 3000 + 800", 0.0, [7, 8])
+    assert rows["planner"][2].tolist() == [[1, 1], [1, 1]] == rows["another's plan"][2].tolist()
+    assert rows["planner, seldom"][2].tolist() == [[0, 0], [0, 0]]
+    assert torch.equal(rows["planner, seldom"][0], rows["humans"][0])
+    assert bool((rows["planner"][0] > rows["humans"][0]).all())
