@@ -48,7 +48,7 @@ def test_report_files(drag: Discovery, tmp_path: Path) -> None:
     assert {"schema", "verdict", "found", "error", "candidates", "data", "seed", "versions"} <= set(report)
     assert {c["effect"] for c in report["candidates"]} >= set(FEW) - {"leader_acceleration"}
     page = paths["report.html"].read_text()
-    assert page.count("data:image/png;base64,") >= 7
+    assert page.count("data:image/png;base64,") == 6
     assert not re.search(r'(src|href)="(?!data:)', page)  # nothing is fetched from elsewhere
     model = load_model(paths["model.yaml"])
     assert [e.name for e in model.effects] == ["idm", "leader_acceleration", "brakes"]
