@@ -7,7 +7,7 @@ the first one commands nobody. Rows, on the same episodes of 600 s:
 
 * *humans*: nobody is commanded.
 * *planner*: without drivers' noise it knows the future. With noise its copies have another one: the mean of
-  ``BRANCHES`` counts.
+  several counts (``--branches``).
 * *planner, seldom*: it commands only what saves ``WORTH`` vehicle-seconds more than no command.
 * *another's plan*: what the planner chose in the next episode, which tells what the same commands are worth blindly.
 
@@ -37,8 +37,8 @@ RULES = (40.0, 40.0, 40.0), (20.0, 20.0, 20.0), (15.0, 15.0, 15.0), (10.0, 10.0,
 """Speeds (m/s) on the ramp's lane, on the one beside it and on the left one; 40 holds nobody."""
 PLACE, EVERY, AHEAD, SECONDS = 500.0, 20, 60, 600
 """Where rules end (m), seconds between decisions, those that one looks ahead, and of an episode; a step is one."""
-BRANCHES, WORTH, BROKEN = 4, 30.0, 4.0
-"""Copies for each rule under noise, vehicle-seconds, and vehicle-hours."""
+WORTH, BROKEN = 30.0, 4.0
+"""Vehicle-seconds, and vehicle-hours."""
 OTHER_NOISE = 1 << 42
 """First seed of the copies' noise, above those of all episodes."""
 
@@ -85,20 +85,22 @@ def foresee(batch: Batch, copies: Batch, first: int) -> Tensor:
     return drive(copies, choices, AHEAD)[0].view(batch.count, len(RULES), branches).mean(-1)
 
 
-def planner(name: str, noise: float, count: int, worth: float) -> Choose:
+def planner(name: str, noise: float, count: int, branches: int, worth: float) -> Choose:
     """Return what chooses the best rule, and no command where none saves so many vehicle-seconds more."""
-    copies = episodes_of(name, noise, range(count * len(RULES) * (BRANCHES if noise else 1)))
+    copies = episodes_of(name, noise, range(count * len(RULES) * (branches if noise else 1)))
     free = torch.tensor([worth] + [0.0] * (len(RULES) - 1))
     return lambda batch, i: (foresee(batch, copies, OTHER_NOISE + i * copies.count) + free).argmax(-1)
 
 
-def rows_of(name: str, noise: float, seeds: Sequence[int]) -> dict[str, tuple[Tensor, Tensor, Tensor, float]]:
+def rows_of(
+    name: str, noise: float, seeds: Sequence[int], branches: int
+) -> dict[str, tuple[Tensor, Tensor, Tensor, float]]:
     """Return returns (vehicle-h) and crashes ``(n,)``, chosen rules ``(decisions, n)`` and CPU s, by row."""
     count, rows = len(seeds), dict[str, tuple[Tensor, Tensor, Tensor, float]]()
     ways: dict[str, Callable[[], Choose]] = {
         "humans": lambda: lambda batch, i: torch.zeros(count, dtype=torch.long),
-        "planner": lambda: planner(name, noise, count, 0.0),
-        "planner, seldom": lambda: planner(name, noise, count, WORTH),
+        "planner": lambda: planner(name, noise, count, branches, 0.0),
+        "planner, seldom": lambda: planner(name, noise, count, branches, WORTH),
         "another's plan": lambda: lambda batch, i: rows["planner"][2][i].roll(-1),
     }
     for who, way in ways.items():
@@ -113,7 +115,7 @@ def rows_of(name: str, noise: float, seeds: Sequence[int]) -> dict[str, tuple[Te
 
 def main(
     name: Literal["merge 3000 + 800", "merge 2400 + 500"] = "merge 3000 + 800",
-    noise: Sequence[float] = (0.0, 0.2), episodes: int = 64, draw: int = 1,
+    noise: Sequence[float] = (0.0, 0.2), episodes: int = 64, draw: int = 1, branches: int = 4,
 ) -> None:  # fmt: skip
     """Print the rows of a task.
 
@@ -122,12 +124,13 @@ def main(
         noise: Of drivers (m/s² per √s), each in turn.
         episodes: How many are judged.
         draw: Of these episodes.
+        branches: Copies of a world for each rule under noise.
     """
     torch.set_num_threads(1)
     head = "noise, row, return in vehicle-h, more than humans, least shown, broken down, crashes, commands, CPU s"
     lines = list[list[str]]()
     for sigma in noise:
-        rows = rows_of(name, sigma, range(SEED + 1000 * draw, SEED + 1000 * draw + episodes))
+        rows = rows_of(name, sigma, range(SEED + 1000 * draw, SEED + 1000 * draw + episodes), branches)
         for who, (paid, crashed, choices, spent) in rows.items():
             more = paid - rows["humans"][0]
             error, share = float(more.std()) / episodes**0.5, 100.0 * float((choices > 0).float().mean())

@@ -165,7 +165,7 @@ def test_a_planner_that_must_save_more_commands_less_and_each_row_is_of_the_same
     for name, value in {"SECONDS": 8, "EVERY": 4, "AHEAD": 4, "WORTH": 1e6}.items():
         monkeypatch.setattr(lane_planner, name, value)
     monkeypatch.setattr(lane_planner, "RULES", (lane_planner.RULES[3], lane_planner.RULES[0]))
-    rows = lane_planner.rows_of("merge 3000 + 800", 0.0, [7, 8])
+    rows = lane_planner.rows_of("merge 3000 + 800", 0.0, [7, 8], 1)
     assert rows["planner"][2].tolist() == [[1, 1], [1, 1]] == rows["another's plan"][2].tolist()
     assert rows["planner, seldom"][2].tolist() == [[0, 0], [0, 0]]
     assert torch.equal(rows["planner, seldom"][0], rows["humans"][0])
