@@ -70,8 +70,8 @@ class OpenLanesTask(LanesTask):
     ``filled``. Whoever finds no room there, or at his entry, waits and is counted (``multilane.demand.counts``).
 
     One vehicle is the agent (``controlled=1``): it is on the road when an episode begins, and enters again as soon as
-    it has left, where there is an on-ramp always there. Its commands are accelerations, held for 1 s, and are added to
-    what its driver would do: zeros are human driving.
+    it has left. Where there is an on-ramp it enters there, the first time within 3 s. Its commands are accelerations,
+    held for 1 s, and are added to what its driver would do: zeros are human driving.
     ``controlled=0.1, careful=True, added=False, reward="traffic"`` is the joint form: agents are the vehicles of slots,
     and a command counts only as far as the driver himself would go, so that none makes a crash. The joint face tells by
     ``info["present"]`` who is there; with PettingZoo every trip is an agent of its own. While an agent's vehicle waits
