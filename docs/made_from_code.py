@@ -205,7 +205,7 @@ def _meaning(function: Any) -> str:
     return text.replace("``", "`").replace("|", "\\|")
 
 
-MEASURED = {"highway": "2026-11-26"}
+MEASURED = {"highway": "2026-11-27 (seeds 1 to 4: 2026-11-26)"}
 """When tables of skill were measured, where not on 2026-11-27."""
 ROWS = {
     "human": "*Human* is `step(None)`.",
