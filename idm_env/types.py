@@ -373,9 +373,14 @@ def recording() -> Iterator[None]:
         _RECORDED.reset(before)
 
 
+def is_recording() -> bool:
+    """Return whether work is being recorded."""
+    return _RECORDED.get()
+
+
 def worthwhile(mask: Tensor) -> bool:
     """Return whether any is true, so that work for those alone can be left out where there are none.
 
     True, and nothing is asked, where the answer would be waited for (a GPU) or is not one for all values (a recording).
     """
-    return mask.device.type != "cpu" or _RECORDED.get() or torch.compiler.is_compiling() or bool(mask.any())
+    return mask.device.type != "cpu" or is_recording() or torch.compiler.is_compiling() or bool(mask.any())

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from idm_env import compat
-from idm_env.types import Driver, Motion, Scene, Wish
+from idm_env.types import Driver, Motion, Scene, Wish, is_recording
 
 RETURNS: dict[str, type] = {"perceive": Scene, "adapt": Driver, "driver": Driver, "place": Motion, "change": Wish}
 RETURNS |= dict.fromkeys(("accelerate", "limit", "remember", "initial_memory", "room"), Tensor)
@@ -34,7 +34,7 @@ def watched(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         who = f"effect '{self.name}': {type(self).__name__}.{name}"
         seen = [_Limited.of(x, self.looks_back, who) if isinstance(x, Scene) else x for x in args]
         leaves = dict(leaf for x in args for leaf in _leaves(x))
-        recorded = any(hasattr(x, "suspected") for x in leaves.values())
+        recorded = is_recording() or any(hasattr(x, "suspected") for x in leaves.values())
         before = {k: x._version for k, x in leaves.items() if not recorded and not x.is_inference()}
         try:
             result = method(self, *seen)

@@ -19,6 +19,7 @@ from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 from idm_env.tasks import Feature
 from idm_env.tasks.reward_terms import RewardTerm
+from tests.laws.test_own_effects import own
 
 OWN = {"gain": 1.07, "items": [1.0, 2.03], "weight": torch.tensor([0.93]), "array": np.full(3, 1.19, np.float32)}
 GAIN = 1.13
@@ -216,3 +217,14 @@ def test_an_effect_reads_what_is_there_now():
         with backends.off():
             own = simulator.rollout(state, {}, params, 5)[0]
         torch.testing.assert_close(last.speed, own.speed)
+
+
+@pytest.mark.filterwarnings("error:no compiled step")
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_steps_with_effects_of_ones_own_are_compiled(output: str) -> None:
+    """Watching what they return asks no number of a step that is recorded."""
+    effect = own("accelerate", lambda s, d, p: -0.1 * s.speed)
+    env = DiffIDMVectorEnv(2, task="ring", effects=(effect,), output=output)
+    env.reset(seed=1)
+    action = torch.zeros(2, 1) if output == "torch" else np.zeros((2, 1), np.float32)
+    assert np.isfinite(np.asarray(env.step(action)[0])).all()
