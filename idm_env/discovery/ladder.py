@@ -159,8 +159,7 @@ def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, f
     """
     rows = windows(records)
     error = models[last].ahead
-    drift, scene, past = _drift(rows, error), _scene(rows), _past(rows)
-    rest = error - Ridge.fit(rows, error, drift).predicted
+    scene, past, rest = _scene(rows), _past(rows), _beside_drift(rows, error)
     left = {
         "drift followed": rest,
         "smooth function of the scene": rest - _smooth(rows, rest, scene, seed, FEATURES),
@@ -207,12 +206,12 @@ def _crps(rows: Rows, error: np.ndarray) -> float:
 
 def followed(rows: Rows, error: np.ndarray) -> Share:
     """Return the share of squared errors [W] that a driver's other errors foresee, and its interval."""
-    return _share(rows, error, error - Ridge.fit(rows, error, _drift(rows, error)).predicted, error)
+    return _share(rows, error, _beside_drift(rows, error), error)
 
 
 def structure(rows: Rows, error: np.ndarray, seed: int, features: int) -> Share:
     """Return the share of squared errors [W] that a smooth function of the scene takes beside drift, and interval."""
-    rest = error - Ridge.fit(rows, error, _drift(rows, error)).predicted
+    rest = _beside_drift(rows, error)
     return _share(rows, rest, rest - _smooth(rows, rest, _scene(rows), seed, features), error)
 
 
@@ -244,6 +243,11 @@ def dependences(rows: Rows, error: np.ndarray, seed: int) -> tuple[Dependence, .
             Dependence(name, unit, *(x.tolist() for x in (back(grid), effect, effect - width, effect + width)))
         )
     return tuple(curves)
+
+
+def _beside_drift(rows: Rows, error: np.ndarray) -> np.ndarray:
+    """Return what a driver's other errors do not foresee [W]."""
+    return np.asarray(error - Ridge.fit(rows, error, _drift(rows, error)).predicted)
 
 
 def _drift(rows: Rows, error: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ speed grow in windows of 5 s. Every follower drives behind his measured leader. 
 tells of errors in them is what noise alone does: the scene has felt it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -139,19 +140,15 @@ def agreement(
     """
     drivers, random = drivers_of(problem, solution, noise_m), np.random.default_rng(seed)
 
-    def scene(windowed: Problem, theta: np.ndarray) -> float:
-        return ladder.structure(windowed.rows, ahead(windowed, theta, drivers.model), seed, FEATURES).share
+    def scene(rows: Rows, error: np.ndarray) -> float:
+        return ladder.structure(rows, error, seed, FEATURES).share
 
-    def past(windowed: Problem, theta: np.ndarray) -> float:
-        return ladder.followed(windowed.rows, ahead(windowed, theta, drivers.model)).share
+    def past(rows: Rows, error: np.ndarray) -> float:
+        return ladder.followed(rows, error).share
 
-    def sizes(windowed: Problem, theta: np.ndarray) -> float:
-        size = np.abs(ahead(windowed, theta, drivers.model))
-        relative = size / by_group(windowed.rows, size + tails.FLOOR_M) - 1.0
-        return ladder.structure(windowed.rows, relative, seed, FEATURES).share
-
-    def tail(windowed: Problem, theta: np.ndarray) -> float:
-        return tails.concentration(windowed.rows, ahead(windowed, theta, drivers.model))
+    def sizes(rows: Rows, error: np.ndarray) -> float:
+        size = np.abs(error)
+        return scene(rows, size / by_group(rows, size + tails.FLOOR_M) - 1.0)
 
     def gain(windowed: Problem, theta: np.ndarray) -> float:
         assert term is not None
@@ -161,17 +158,20 @@ def agreement(
         mean = float(log_gain(held_out(windowed, before), held_out(windowed, after)).mean())
         return 1.0 - float(np.exp(-2.0 * mean))
 
-    statistics = {"scene": scene, "tails": tail, "sizes": sizes, "past": past} | (
-        {} if term is None else {"leading": gain}
-    )
-    mine = {name: f(problem, solution.theta) for name, f in statistics.items()}
+    of_errors = {"scene": scene, "tails": tails.concentration, "sizes": sizes, "past": past}
+
+    def told(windowed: Problem, theta: np.ndarray, names: Sequence[str]) -> dict[str, float]:
+        error = ahead(windowed, theta, drivers.model)
+        return {n: of_errors[n](windowed.rows, error) if n in of_errors else gain(windowed, theta) for n in names}
+
+    mine = told(problem, solution.theta, [*of_errors, *([] if term is None else ["leading"])])
     above, draws = dict.fromkeys(mine, 0), dict.fromkeys(mine, 0)
     for draw in range(1, DRAWS + 1):
         if not (still := [name for name in mine if above[name] < ENOUGH]):
             break
         replica, theta = _fitted(problem, drivers, random, noise_m)
-        for name in still:
-            above[name] += statistics[name](replica, theta) >= mine[name]
+        for name, value in told(replica, theta, still).items():
+            above[name] += value >= mine[name]
             draws[name] = draw
     p = {name: a / draws[name] if a == ENOUGH else (a + 1) / (draws[name] + 1) for name, a in above.items()}
     return drivers, {name: ladder.Agreement(mine[name], p[name], draws[name]) for name in mine}
