@@ -420,8 +420,7 @@ class RowFunction:
         if name == "masked_fill":
             name, args = "where", (args[1], args[2], args[0])
         if name in self.unary or name in ("_to_copy", "clone"):
-            form = self.unary.get(name, "{0}")
-            form = form.replace("tanh(", "np.tanh(") if to.kind == "d" else form
+            form = "np.tanh({0})" if name == "tanh" and to.kind == "d" else self.unary.get(name, "{0}")
             kind = None if name == "isinf" else to.kind
             return self._each(to, shape, lambda cell: form.format(self._at(args[0], cell, kind)))
         if name in BINARY or name in COMPARE:
