@@ -18,6 +18,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
@@ -361,6 +362,13 @@ def mapped(function: Callable[..., Tensor], first: Tree, *rest: Any) -> Tree:
         return first
     parts = (mapped(function, *each) for each in zip(first, *rest, strict=True))
     return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)  # type: ignore[return-value]
+
+
+@lru_cache(1024)
+def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return the tensor of these numbers, made once: a GPU waits for every copy of Python's numbers."""
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=dtype, device=device)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from torch import Tensor
 from idm_env.roads import Road
 from idm_env.roads.linked import standing, still_changing, without_absent
 from idm_env.step import CarFollowingStep
-from idm_env.types import ENTRY_SPEED, FAR, Moving, Params, State, Trips, worthwhile
+from idm_env.types import ENTRY_SPEED, FAR, Moving, Params, State, Trips, constant, worthwhile
 
 
 class Counts(NamedTuple):
@@ -103,7 +103,7 @@ def _begins(road: Road, like: Tensor) -> Tensor:
     outline = road.outline
     if outline is None or outline.ring is not None:
         raise ValueError("trips need a road that begins somewhere: Lanes(count), or Lanes(count, length=…).")
-    return torch.tensor([begin for begin, *_ in outline.lanes], dtype=like.dtype, device=like.device)
+    return constant(tuple(begin for begin, *_ in outline.lanes), like.dtype, like.device)
 
 
 def due(schedule: Trips, time: Tensor) -> Tensor:

@@ -6,10 +6,10 @@ Shapes: what belongs to vehicles is ``[..., n]``, places are in m.
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-import torch
 from torch import Tensor
 
 from idm_env.roads.adjacent import is_open_beside
+from idm_env.types import constant
 from idm_env.validation import at_least, one_of, whole
 
 ENDLESS = 1e9
@@ -111,7 +111,7 @@ class LaneLayout:
 
     def at_lane(self, lane: Tensor, like: Tensor, name: Where) -> Tensor:
         """Return, for each vehicle, a number of its lane."""
-        return torch.tensor(self.table(name), dtype=like.dtype, device=like.device)[lane]
+        return constant(self.table(name), like.dtype, like.device)[lane]
 
     def closed_at(self, lane: Tensor, like: Tensor) -> Tensor:
         """Return where a virtual leader stands on each vehicle's lane (m), ``ENDLESS`` where none does."""

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._pytree import tree_leaves
 
 from idm_env import Lane, Lanes, Ring, Simulator
 from idm_env.effects import ALL, CarFollowing, Effect, make
@@ -25,6 +27,19 @@ from tests.laws.members import inputs_for
 META = torch.device("meta")
 ROADS = {"lane": Lane(), "ring": Ring(), "lanes": Lanes(2, length=600.0), "round": Lanes(2, ring=500.0, duration=3.0)}
 """Straight lanes are entered and left, and changes on the round ones take time."""
+
+
+class NothingBrought(TorchFunctionMode):
+    """Refuse tensors that are made of Python's numbers, or come from the CPU: a GPU waits for each such copy."""
+
+    def __torch_function__(self, function: Any, kinds: Any, arguments: Any = (), keywords: Any = None) -> Any:
+        """Return what the function returns."""
+        name, given = getattr(function, "__name__", ""), tree_leaves((arguments, keywords or {}))
+        tensors = [x for x in given if isinstance(x, torch.Tensor)]
+        assert name not in ("tensor", "as_tensor", "new_tensor", "from_numpy") or tensors[:1] == given[:1], given
+        assert not (name == "__getitem__" and any(isinstance(x, list) for x in arguments[1:])), given
+        assert all(x.device == META for x in tensors if x.dim()), f"{name} of tensors on the CPU"
+        return function(*arguments, **(keywords or {}))
 
 
 def there(tree: Any) -> Any:
@@ -71,7 +86,10 @@ def test_no_effect_asks_a_tensor_for_its_value(road):
         params = simulator.defaults(dtype=torch.float32)
         state = simulator.state(position, torch.full((2, 6), 10.0), params, **more)
         inputs = inputs_for(simulator, 1, state.speed)
-        last, kept = simulator.rollout(there(state), there(inputs), there(params), 1)
+        arguments = there(state), there(inputs), there(params)
+        simulator.rollout(*arguments, 1)  # what is made once for a device
+        with NothingBrought():
+            last, kept = simulator.rollout(*arguments, 1)
         assert last.speed.device == kept.gap.device == META, [e.name for e in simulator.effects]
         tried |= {type(e) for e in simulator.effects}
     assert not every or tried == {e for e in ALL.values() if several or e.hook != "change"}
@@ -89,5 +107,8 @@ def test_no_task_asks_a_tensor_for_its_value(task):
     if batch.counters is not None:
         batch.counters.stops = there(batch.counters.stops)
         batch.counters.begin(np.arange(0), batch.world.state)
-    outcome = batch.step(torch.zeros(2, env.action_space.shape[-1], device=META))
+    action = torch.zeros(2, env.action_space.shape[-1], device=META)
+    batch.step(action)
+    with NothingBrought():
+        outcome = batch.step(action)
     assert outcome.observation.device == outcome.reward.device == outcome.terminated.device == META
