@@ -16,9 +16,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
@@ -27,6 +26,7 @@ from torch import Tensor
 Tree = TypeVar("Tree")
 """A tensor, None, or a tuple or mapping of trees."""
 
+_CONSTANTS: dict[tuple[Any, ...], Tensor] = {}
 _RECORDED: ContextVar[bool] = ContextVar("recorded", default=False)
 
 FAR = 1e4
@@ -364,11 +364,17 @@ def mapped(function: Callable[..., Tensor], first: Tree, *rest: Any) -> Tree:
     return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)  # type: ignore[return-value]
 
 
-@lru_cache(1024)
 def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the tensor of these numbers, made once: a GPU waits for every copy of Python's numbers."""
-    with torch.inference_mode(False):
-        return torch.tensor(values, dtype=dtype, device=device)
+    tensor = None if torch.compiler.is_compiling() else _CONSTANTS.get((values, dtype, device))
+    if tensor is None:
+        with torch.inference_mode(False):
+            tensor = torch.tensor(values, dtype=dtype, device=device)
+        with suppress(NotImplementedError):
+            tensor.untyped_storage()  # raises within torch.func, whose tensors end with the transform
+            if type(tensor) is Tensor and not torch.compiler.is_compiling():
+                _CONSTANTS[values, dtype, device] = tensor
+    return tensor
 
 
 @contextmanager

@@ -6,6 +6,7 @@ torch's ``meta`` device is the instrument: its tensors have no values, and whoev
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Iterator
 from itertools import islice
 from typing import Any
@@ -21,7 +22,7 @@ from idm_env.effects import ALL, CarFollowing, Effect, make
 from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.roads import Road
 from idm_env.tasks import TASKS
-from idm_env.types import mapped
+from idm_env.types import constant, mapped
 from tests.laws.members import inputs_for
 
 META = torch.device("meta")
@@ -112,3 +113,20 @@ def test_no_task_asks_a_tensor_for_its_value(task):
     with NothingBrought():
         outcome = batch.step(action)
     assert outcome.observation.device == outcome.reward.device == outcome.terminated.device == META
+
+
+def test_a_constant_outlives_the_transform_in_which_it_was_made():
+    """And a recording of torch.compile holds it without a word."""
+
+    def total(x: torch.Tensor) -> torch.Tensor:
+        return (constant((3.0, 4.0), torch.float32, torch.device("cpu")) * x).sum()
+
+    assert torch.func.grad(total)(torch.tensor(2.0)) == 7.0
+    with torch.inference_mode():
+        assert total(torch.tensor(2.0)) == 14.0
+    x = torch.tensor(2.0, requires_grad=True)
+    total(x).backward()
+    assert x.grad == 7.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.compile(total, fullgraph=True, backend="eager")(torch.tensor(2.0)) == 14.0
