@@ -122,6 +122,7 @@ def test_a_constant_outlives_the_transform_in_which_it_was_made():
         return (constant((3.0, 4.0), torch.float32, torch.device("cpu")) * x).sum()
 
     assert torch.func.grad(total)(torch.tensor(2.0)) == 7.0
+    constant((3.0, 4.0), torch.float32, torch.device("cpu")).untyped_storage()  # raises for one that ended with it
     with torch.inference_mode():
         assert total(torch.tensor(2.0)) == 14.0
     x = torch.tensor(2.0, requires_grad=True)
