@@ -73,8 +73,6 @@ def drift_file(
         data["account"] = page.account(trajectories.repairs, both[0].left_out)
         named = {"none": answer.steady, **answer.found}
         result = {
-            "schema": 1,
-            "command": page.command_line(),
             "verdict": answer.verdict,
             "one_of": list(answer.one_of),
             "sentence": f"{foreseen} {sentence(answer)}".lstrip(),
@@ -82,13 +80,11 @@ def drift_file(
             "kept_back": {"drivers": len(rest), "scores": scores},
             "estimates": {name: [] if e.why_not else e.table() for name, e in named.items()},
             "data": {**trajectories.summary(), **data},
-            "versions": page.versions(),
         }
-        storage.write_json(out / "report.json", result)
         title, template = f"How the drivers of {trajectories.source} drift", Path(__file__).with_name("drift.html")
-        page.write_page(out / "report.html", title, template=template, r=result, tables=tables)
+        report = page.write_report(out, title, template, result, tables=tables)
         store.remove()
-        return result
+        return report
 
 
 def model_of(estimate: Estimate) -> Model:

@@ -169,8 +169,6 @@ def _write(
     unseen = rest.get("gap_rmse_m"), options.by, rest.get("parts", "runs")
     fit = {**error, "groups": len(estimates.groups), "converged": joined.converged, "iterations": joined.iterations}
     result: dict[str, Any] = {
-        "schema": 1,
-        "command": page.command_line(),
         "data": data,
         "options": {**vars(options), "free": estimates.names},
         "fit": fit,
@@ -180,7 +178,6 @@ def _write(
         "over_fitting": drivers.over_fitting(bounds, error["gap_rmse_m"], *unseen),
         "bounds": bounds,
         "parameters": [],
-        "versions": page.versions(),
     }
     work.progress("writing", 0, 0, "the report")
     joined.parts.join(pieces.DRIVERS, out / "drivers.csv")
@@ -196,11 +193,14 @@ def _write(
         (out / "model.yaml").unlink(missing_ok=True)  # of an earlier fit
     else:
         save_model(out / "model.yaml", model)
-    storage.write_json(out / "report.json", result)
     title = f"{estimates.simulator.base.title} fitted to {data['source']}"
-    _write_fit_page(out / "report.html", title, result, joined, table)
+    errors_in_words = in_words([{"": "fitted", **fit}] + ([{"": f"held-out {rest['parts']}", **rest}] if rest else []))
+    figures = list(zip(("Measured and simulated", "Residuals", "In space and time"), joined.pictures, strict=False))
+    names: dict[str, Any] = {"rows": errors_in_words, "figures": figures, "joined": joined, "table": table}
+    names |= {"drivers": drivers, "pictures": pictures}
+    report = page.write_report(out, title, TEMPLATES / "fit.html", result, **names)
     joined.parts.remove()
-    return result
+    return report
 
 
 def _drivers(items: Episodes) -> list[tuple[str, str]]:
@@ -247,16 +247,6 @@ def model_of(found: Estimates, by: str = "driver") -> Model:
         drivers={g: nested(named(found.values[i])) for i, g in enumerate(found.groups)} if several else {},
         by=by,
     )
-
-
-def _write_fit_page(
-    path: Path, title: str, result: dict[str, Any], joined: JoinedFit, table: list[dict[str, Any]]
-) -> None:
-    held = result["held_out"]
-    rows = [{"": "fitted", **result["fit"]}] + ([] if held is None else [{"": f"held-out {held['parts']}", **held}])
-    figures = list(zip(("Measured and simulated", "Residuals", "In space and time"), joined.pictures, strict=False))
-    names: dict[str, Any] = {"r": result, "rows": in_words(rows), "figures": figures, "joined": joined, "table": table}
-    page.write_page(path, title, template=TEMPLATES / "fit.html", drivers=drivers, pictures=pictures, **names)
 
 
 def _overlap(model: Model, overlap: dict[Track, str] | None, items: Episodes, error: Errors) -> dict[str, Any]:
@@ -324,9 +314,7 @@ def _simulate_file(
     progress("writing", 0, 0, "the report")
     tables = [_simulated_table(problem, simulated, row) for row in range(len(items))]
     storage.write(out / "simulated.parquet", pl.concat(tables).write_parquet)
-    result: dict[str, Any] = {
-        "schema": 1,
-        "command": page.command_line(),
+    result = {
         "model": name,
         "data": _data(trajectories, items),
         "drivers_with_own_parameters": matched,
@@ -334,13 +322,10 @@ def _simulate_file(
         "error": error.summary(),
         "fitted_on": _overlap(model, same, items, error),
         "seed": seed,
-        "versions": page.versions(),
     }
-    storage.write_json(out / "report.json", result)
-    names: dict[str, Any] = {"r": result, "rows": in_words([error.summary()]), "shown": (problem, error, simulated)}
+    names = {"rows": in_words([error.summary()]), "shown": (problem, error, simulated), "pictures": pictures}
     title = f"{Path(name).name} behind the leaders of {source.path.name}"
-    page.write_page(out / "report.html", title, template=TEMPLATES / "simulate.html", pictures=pictures, **names)
-    return result
+    return page.write_report(out, title, TEMPLATES / "simulate.html", result, **names)
 
 
 def in_words(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

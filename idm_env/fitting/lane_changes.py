@@ -153,10 +153,8 @@ def fit_lane_changes(
         progress("writing", 0, 0, "the report")
         result = _result(fit, trajectories, options)
         save_model(out / "model.yaml", fit.model)
-        storage.write_json(out / "report.json", result)
         template, title = Path(__file__).with_suffix(".html"), f"Lane changes of {trajectories.source}"
-        page.write_page(out / "report.html", title, template=template, r=result, picture=_calibration_picture(fit))
-        return result
+        return page.write_report(out, title, template, result, picture=_calibration_picture(fit))
 
 
 def _result(fit: LaneChanges, trajectories: Trajectories, options: ChangeOptions) -> dict[str, Any]:
@@ -166,8 +164,6 @@ def _result(fit: LaneChanges, trajectories: Trajectories, options: ChangeOptions
     counts = {"count": len(decisions), "changes": decisions.changes, "left": left, "right": decisions.changes - left}
     vehicles = int(decisions.vehicle.unique().numel())
     return {
-        "schema": 1,
-        "command": page.command_line(),
         "data": {**trajectories.summary(), "left_out": [str(r) for r in decisions.left_out], "account": account},
         "options": vars(options),
         "decisions": {**counts, "vehicles": vehicles},
@@ -175,7 +171,6 @@ def _result(fit: LaneChanges, trajectories: Trajectories, options: ChangeOptions
         "models": compared,
         "calibration": fit.calibration(),
         "sentence": _sentence(fit, compared),
-        "versions": page.versions(),
     }
 
 

@@ -84,7 +84,7 @@ def _predict_files(
         raise DataError(f"no scenario can be used: {first}")
     parts.join("predictions", out / "predictions.parquet")
     parts.join("parameters", out / "parameters.parquet")
-    written.write(out, report, pictures)
+    report = written.write(out, report, pictures)
     parts.remove()
     return report
 
@@ -230,5 +230,4 @@ def _report(parts: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], list[page.
         "left_out": left_out,
         "account": page.account((), repaired("agents", len(left_out) - len(bad), ""), bad),
         "notes": [item for part in parts for item in part["notes"]],
-        "versions": page.versions(),
     }, pictures[:MOST_PICTURES]

@@ -4,26 +4,23 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from idm_env.jobs import storage
 from idm_env.prediction.metrics import ENOUGH_SCENES, HORIZONS
 from idm_env.reports import page
 
 WHAT = (("minADE", "minADE (m)"), ("minFDE", "minFDE (m)"), ("miss_rate", "miss rate"), ("mAP", "mAP"))
 
 
-def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> None:
-    """Write ``report.json`` and ``report.html``."""
-    storage.write_json(out / "report.json", report)
+def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> dict[str, Any]:
+    """Write and return the report."""
     several = "" if report["scenarios"] == 1 else "s"
     title = f"Predictions of {report['agents']} agents in {report['scenarios']} scenario{several}"
     names: dict[str, Any] = {
-        "r": report,
         "pictures": page.Block("gallery", rows=tuple(pictures)),
         "metrics": metrics,
         "groups": groups,
     }
     names |= {"shortened": page.shortened, "enough_scenes": ENOUGH_SCENES}
-    page.write_page(out / "report.html", title, template=Path(__file__).with_name("predict.html"), **names)
+    return page.write_report(out, title, Path(__file__).with_name("predict.html"), report, **names)
 
 
 def metrics(rows: Sequence[dict[str, Any]]) -> page.Block:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from idm_env.extras import needed
-from idm_env.jobs.storage import write_text
+from idm_env.jobs.storage import write_json, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -185,6 +185,17 @@ def write_page(
         title=title, blocks=list(blocks), following=next_command(path.parent), **content
     )
     write_text(path, page)
+
+
+def write_report(out: Path, title: str, template: Path, result: Mapping[str, Any], **content: Any) -> dict[str, Any]:
+    """Write ``report.json`` and the page that shows it, ``report.html``, and return the report.
+
+    The report is ``result`` between its schema and command, and the versions. The ``template`` reads it as ``r``.
+    """
+    report = {"schema": 1, "command": command_line(), **result, "versions": versions()}
+    write_json(out / "report.json", report)
+    write_page(out / "report.html", title, template=template, r=report, **content)
+    return report
 
 
 def account(repairs: Iterable[Any] = (), left_out: Iterable[Any] = (), bad_files: Iterable[str] = ()) -> str:

@@ -23,7 +23,7 @@ from idm_env.jobs import storage
 from idm_env.jobs.executor import Executor, Serial
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.jobs.shards import Parts
-from idm_env.reports.page import account, versions
+from idm_env.reports.page import account
 from idm_env.trajectories import chunks, left_out, paper
 from idm_env.trajectories.chunks import CHUNK, OURS, PARAMETERS, TRAJECTORIES, FilePlan, FilterSettings, Recipe
 from idm_env.trajectories.noise import fit_noise, is_dense
@@ -124,7 +124,7 @@ def _run(
     report = _report(spool, summaries, settings, plan) | {"left_out_points": scored}
     figures = space_time(out / "trajectories.parquet", spool, bridge)
     parameters = pl.read_parquet(out / "parameters.parquet", glob=False)
-    write_report(out, report, _shown(out, spool, bridge), parameters, figures)
+    report = write_report(out, report, _shown(out, spool, bridge), parameters, figures)
     parts.remove()
     return report
 
@@ -255,7 +255,6 @@ def _report(spool: Spool, parts: Sequence[dict[str, Any]], settings: FilterSetti
         "overlapping_rows": totals["overlaps"],
         "overlapping_rows_that_did_not_overlap_before": totals["new_overlaps"],
         "account": account(spool.repairs, repaired("tracks", len(lost), "")),
-        "versions": versions(),
     }
 
 

@@ -9,7 +9,6 @@ import polars as pl
 from matplotlib.figure import Figure
 
 from idm_env.effects import IDM
-from idm_env.jobs import storage
 from idm_env.reports import diagrams, page
 from idm_env.trajectories.scores import RegularMotion
 from idm_env.trajectories.spool import Spool
@@ -32,25 +31,22 @@ def write_report(
     report: dict[str, Any],
     shown: Sequence[tuple[TrackPiece, RegularMotion]],
     parameters: pl.DataFrame,
-    figures: Sequence[page.Block] = (),
-) -> None:
-    """Write ``report.json`` and ``report.html`` with the table of methods, and pictures before and after.
+    figures: Sequence[page.Block],
+) -> dict[str, Any]:
+    """Write and return the report: the table of methods, and pictures before and after.
 
     ``figures`` are pictures in space and time.
-
-    Numbers that are not finite become null in JSON, which knows none.
     """
-    storage.write_json(out / "report.json", report)
     how = "filtered" if report["settings"]["task"] == "filter" else "reconstructed"
     lost = [f"{item['track']}: {item['reason']}" for item in report["left_out"]]
     repaired = [item["text"] for item in report["repairs"]]
     repaired += [f"{item['vehicle']}: {item['note']}" for item in report["divided"]]
     lines = {"Left out": page.shortened(lost, MOST_LISTED), "Repaired": page.shortened(repaired, MOST_LISTED)}
     before = [page.picture(before_and_after(track, motion), f"Track {track.key}") for track, motion in shown]
-    names: dict[str, Any] = {"r": report, "figures": figures, "before": before, "lines": lines, "digits": DIGITS}
+    names: dict[str, Any] = {"figures": figures, "before": before, "lines": lines, "digits": DIGITS}
     names |= {"methods": methods, "points": points, "parameters": _parameters(parameters)}
     template, title = Path(__file__).with_name("filter.html"), f"{report['source']}: {how} trajectories"
-    page.write_page(out / "report.html", title, template=template, **names)
+    return page.write_report(out, title, template, report, **names)
 
 
 def points(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
