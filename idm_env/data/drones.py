@@ -23,7 +23,7 @@ import numpy as np
 import polars as pl
 
 from idm_env.data import clock
-from idm_env.data.errors import DataError, Repair, missing_column, repaired
+from idm_env.data.errors import DataError, Repair, refuse_missing, repaired
 from idm_env.data.schema import TRACK
 from idm_env.data.sizes import refuse_size
 
@@ -38,19 +38,19 @@ LENGTHS_M = {"car": 5.0, "taxi": 5.0, "motorcycle": 2.5, "medium vehicle": 5.83,
 Read = tuple[pl.DataFrame, list[Repair]]
 
 
-def layout_of(columns: list[str]) -> str | None:
-    """Return which of the layouts a csv's header is of, None for none of them."""
-    names = {name.strip() for name in columns}
-    if {"frame", "id", "xVelocity", "laneId"} <= names:
-        return "highd"
-    if {"frame", "trackId", "xCenter", "traveledDistance"} <= names:
-        return "exid"
-    return None
+def is_highd(columns: list[str]) -> bool:
+    """Say whether the header is highD's."""
+    return {"frame", "id", "xVelocity", "laneId"} <= {name.strip() for name in columns}
+
+
+def is_exid(columns: list[str]) -> bool:
+    """Say whether the header is exiD's."""
+    return {"frame", "trackId", "xCenter", "traveledDistance"} <= {name.strip() for name in columns}
 
 
 def highd(frame: pl.DataFrame, source: str) -> Read:
     """Return the tidy table of a highD recording; each direction is a run."""
-    _need(frame, ("frame", "id", "x", "width", "xVelocity", "laneId"), source)
+    refuse_missing(("frame", "id", "x", "width", "xVelocity", "laneId"), frame.columns, source)
     right = (pl.col("xVelocity").mean() > 0).over("id")
     front = pl.when(right).then(pl.col("x") + pl.col("width")).otherwise(-pl.col("x"))
     leader = pl.when(pl.col("precedingId") > 0).then(pl.col("precedingId"))
@@ -69,7 +69,8 @@ def highd(frame: pl.DataFrame, source: str) -> Read:
 
 def exid(frame: pl.DataFrame, source: str) -> Read:
     """Return the tidy table of an exiD recording, with gaps between the bodies of a vehicle and its leader."""
-    _need(frame, ("frame", "trackId", "xCenter", "yCenter", "length", "traveledDistance", "leadId"), source)
+    needed = ("frame", "trackId", "xCenter", "yCenter", "length", "traveledDistance", "leadId")
+    refuse_missing(needed, frame.columns, source)
     run = pl.col("recordingId").cast(pl.String) if "recordingId" in frame.columns else pl.lit("0")
     frame = frame.with_columns(run.alias("run_id"))
     ahead = frame.select("run_id", "frame", "trackId", "xCenter", "yCenter", "length").rename({"trackId": "leadId"})
@@ -169,12 +170,5 @@ def i24(path: Path) -> Read:
     return table.drop("step"), repaired("broken document", broken, "documents without a whole track were left out.")
 
 
-def _need(frame: pl.DataFrame, names: tuple[str, ...], source: str) -> None:
-    for name in names:
-        if name not in frame.columns:
-            raise missing_column(name, frame.columns, source)
-
-
-CSV: dict[str, Callable[[pl.DataFrame, str], Read]] = {"highd": highd, "exid": exid}
 FILES: dict[str, Callable[[Path], Read]] = {"pneuma": pneuma, "i24": i24}
-"""Layouts by name: those of a csv's columns, and those that read the file themselves."""
+"""Layouts, by name, that read the file themselves."""

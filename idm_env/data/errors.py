@@ -68,6 +68,12 @@ def listed(names: Iterable[str], most: int = 12) -> str:
     return shown if len(all_names) <= most else f"{shown} and {len(all_names) - most} more"
 
 
+def refuse_missing(names: Iterable[str], columns: Iterable[str], source: str) -> None:
+    """Raise DataError for the first of the names that is no column."""
+    if absent := [name for name in names if name not in columns]:
+        raise missing_column(absent[0], columns, source)
+
+
 def missing_column(name: str, columns: Iterable[str], source: str, others: Iterable[str] = ()) -> DataError:
     """Return the error for a column that a file lacks, suggesting the nearest name that is none of `others`."""
     names = list(columns)

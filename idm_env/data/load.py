@@ -11,13 +11,21 @@ from typing import Any
 import polars as pl
 
 from idm_env.data import drones, folder, ngsim, openacc, pair, plain, tidy, ultra_av
-from idm_env.data.errors import DataError, Repair, listed, missing_column, nearest
+from idm_env.data.errors import DataError, Repair, listed, nearest, refuse_missing
 from idm_env.data.names import Columns, check_columns, renamed, unread
 from idm_env.data.schema import TIDY
 from idm_env.data.sizes import read_parquet, read_whole, unpacked
 from idm_env.data.trajectories import Trajectories, parted
 
-LAYOUTS = ("auto", "tidy", "ngsim", "openacc", "ultra_av", *drones.CSV, *drones.FILES)
+LAYOUTS = ("auto", "tidy", "ngsim", "openacc", "ultra_av", "highd", "exid", *drones.FILES)
+TABLES: dict[str, tuple[Callable[[list[str]], bool], Callable[[pl.DataFrame, str], drones.Read]]] = {
+    "ultra_av": (ultra_av.matches, ultra_av.read),
+    "ngsim": (ngsim.matches, ngsim.read),
+    "highd": (drones.is_highd, drones.highd),
+    "exid": (drones.is_exid, drones.exid),
+    "sumo": (plain.is_sumo, plain.sumo),
+}
+"""Layouts of tables with names of their own: how a header is recognised, and who reads it."""
 EXTENSIONS = (".csv", ".csv.gz", ".parquet", *plain.ENDINGS)
 CURES = {".mat": "in MATLAB, writetable saves csv", ".gpx": "give the way along the road, as csv"}
 CURES |= dict.fromkeys((".xls", ".ods"), "save the sheet as csv")
@@ -120,9 +128,7 @@ def refuse_head(
     frame, _ = read(path, layout=layout, columns=columns, rows=HEAD_ROWS)
     check_columns(frame.columns, path.name)
     has = dict.fromkeys((*frame.columns, *TIDY))
-    for name in [*named, *([] if place is None else [place])]:
-        if name not in has:
-            raise missing_column(name, has, path.name)
+    refuse_missing([*named, *([] if place is None else [place])], has, path.name)
     if by is not None and by not in has:
         guess = nearest(by, has)
         cure = f"Did you mean {guess!r}?" if guess else f"Use driver, all, or one of {listed(frame.columns)}."
@@ -183,7 +189,8 @@ def batches(
         for number, table in enumerate(_pieces(path, extension, written)):
             names = [name.strip().lower() for name in table.columns]
             explain_each_other = ngsim.matches(names) and ("location" in names or "frame_id" not in names)
-            whole = columns is None and (explain_each_other or drones.layout_of(table.columns))
+            by_frame = drones.is_highd(table.columns) or drones.is_exid(table.columns)
+            whole = columns is None and (explain_each_other or by_frame)
             if number == 0 and (whole or pair.matches(columns)):
                 yield read(path, layout=layout, columns=columns)
                 return
@@ -251,15 +258,9 @@ def _plain_layout(
         table, named = (pair.read if pair.matches(columns) else renamed)(table, columns, source)
         frame, repairs = tidy.read(table)
         return frame, [*named, *repairs]
-    if layout == "ultra_av" or (layout == "auto" and ultra_av.matches(table.columns)):
-        return ultra_av.read(table, source)
-    if layout == "ngsim" or (layout == "auto" and ngsim.matches(table.columns)):
-        return ngsim.read(table, source)
-    drone_layout = layout if layout in drones.CSV else drones.layout_of(table.columns) if layout == "auto" else None
-    if drone_layout:
-        return drones.CSV[drone_layout](table, source)
-    if layout == "auto" and {"timestep_time", "vehicle_pos", "vehicle_lane"} <= {*table.columns}:
-        return plain.sumo(table), []
+    for name, (matches, reader) in TABLES.items():
+        if layout == name or (layout == "auto" and matches(table.columns)):
+            return reader(table, source)
     if layout == "auto":
         tidy.check(table.columns, source)
     frame, repairs = tidy.read(table)

@@ -8,7 +8,7 @@ Source: U.S. Federal Highway Administration, Next Generation Simulation, data di
 import polars as pl
 
 from idm_env.data.clean import exact
-from idm_env.data.errors import DataError, Repair, missing_column, repaired
+from idm_env.data.errors import DataError, Repair, refuse_missing, repaired
 
 FOOT_M = 0.3048
 FRAME_S = 0.1
@@ -47,9 +47,7 @@ def read(frame: pl.DataFrame, source: str = "table") -> tuple[pl.DataFrame, list
         both = " and ".join(repr(name) for name in frame.columns if _plain(name) == twice)
         raise DataError(f"{source}: columns {both} are both NGSIM's {twice}; remove one of them.")
     frame = frame.rename(dict(zip(frame.columns, plain, strict=True)))
-    for name in ("vehicle_id", "local_y"):
-        if name not in frame.columns:
-            raise missing_column(name, frame.columns, source)
+    refuse_missing(("vehicle_id", "local_y"), frame.columns, source)
     names = [name for name in _NUMBERS if name in frame.columns]
     frame = frame.with_columns(_number(frame, name, source) for name in names)
     place = pl.col("location").cast(pl.String).str.strip_chars().fill_null("ngsim")

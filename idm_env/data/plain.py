@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import polars as pl
 
 from idm_env.data import ngsim
-from idm_env.data.errors import DataError
+from idm_env.data.errors import DataError, Repair
 from idm_env.data.names import UNITS
 from idm_env.data.schema import TIDY
 from idm_env.data.sizes import read_whole
@@ -196,7 +196,12 @@ def _lengths(path: Path, head: str) -> dict[str, str]:
     return {"DEFAULT_VEHTYPE": "5.0", **lengths} if lengths else {}
 
 
-def sumo(table: pl.DataFrame) -> pl.DataFrame:
+def is_sumo(columns: list[str]) -> bool:
+    """Say whether the header is that of SUMO's floating-car data."""
+    return {"timestep_time", "vehicle_pos", "vehicle_lane"} <= {*columns}
+
+
+def sumo(table: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
     """Return the tidy table of floating-car data: each edge is a run, whose lanes are numbered as in the file.
 
     A gap below 0 is SUMO's word for nobody ahead.
@@ -207,6 +212,6 @@ def sumo(table: pl.DataFrame) -> pl.DataFrame:
     names |= {"vehicle_length": "length_m"}
     columns = [pl.col(old).alias(new) for old, new in names.items() if old in table.columns and table[old].count()]
     rows = table.select(parts, *columns)
-    if "gap_m" not in rows.columns:
-        return rows
-    return rows.with_columns(pl.when(pl.col("gap_m").cast(pl.Float64) >= 0.0).then("gap_m").alias("gap_m"))
+    if "gap_m" in rows.columns:
+        rows = rows.with_columns(pl.when(pl.col("gap_m").cast(pl.Float64) >= 0.0).then("gap_m").alias("gap_m"))
+    return rows, []

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from idm_env.data import schema
-from idm_env.data.errors import DataError, Repair, listed, missing_column
+from idm_env.data.errors import DataError, Repair, listed, refuse_missing
 from idm_env.data.prepare import prepare
 
 __all__ = ["Repair", "Trajectories"]
@@ -62,8 +62,7 @@ class Trajectories:
         """
         table, steps, done = prepare(frame, source, ring_length)
         place = place or "position_m"
-        if place not in table.columns:
-            raise missing_column(place, table.columns, source)
+        refuse_missing([place], table.columns, source)
         if not table[place].dtype.is_numeric():
             raise DataError(f"{source}: place column {place!r} holds text; a place is a number in metres.")
         return cls(table, (*repairs, *done), source, steps, place)
@@ -84,8 +83,7 @@ class Trajectories:
         if not isinstance(condition, str):
             return reduce(Trajectories.where, condition, self)
         column, value = parted(condition)
-        if column not in self.table.columns:
-            raise missing_column(column, self.table.columns, self.source)
+        refuse_missing([column], self.table.columns, self.source)
         text = pl.col(column).cast(pl.String).str.to_lowercase().fill_null("")
         tracks = self.table.group_by(schema.TRACK, maintain_order=True).agg(
             pl.col(column).n_unique().alias("values"), text.first().alias("value")

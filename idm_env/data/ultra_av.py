@@ -6,7 +6,7 @@ Source: Zhou, Ma, Liang, Li, Qu 2024, A unified longitudinal trajectory dataset 
 
 import polars as pl
 
-from idm_env.data.errors import Repair, missing_column
+from idm_env.data.errors import Repair, refuse_missing
 
 NEEDED = ("trajectory_id", "time_index", "pos_lv", "speed_lv", "pos_fav", "speed_fav")
 
@@ -22,9 +22,7 @@ def read(frame: pl.DataFrame, source: str = "table") -> tuple[pl.DataFrame, list
     Both have the mean of their lengths, headway less gap. DataError if a column is missing.
     """
     frame = frame.rename({name: name.strip().lower().replace("spatial_", "space_") for name in frame.columns})
-    for name in NEEDED:
-        if name not in frame.columns:
-            raise missing_column(name, frame.columns, source)
+    refuse_missing(NEEDED, frame.columns, source)
     gap = pl.col("space_gap") if "space_gap" in frame.columns else pl.lit(None, pl.Float64)
     length = pl.lit(None, pl.Float64)
     if {"space_gap", "space_headway"} <= set(frame.columns):
