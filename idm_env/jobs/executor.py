@@ -5,6 +5,7 @@ so that the same part gives the same bytes anywhere, and may be done again after
 files that a part writes in one piece (``parts.Parts``); what comes back through ``map`` is small.
 """
 
+import abc
 import logging
 import os
 import pickle
@@ -105,36 +106,6 @@ class Serial:
         _raise(failed, parts)
 
 
-class Processes:
-    """Processes of this machine, one thread each; those that die are replaced, and their parts done again."""
-
-    def __init__(self, jobs: int) -> None:
-        self.jobs = jobs
-
-    def map(
-        self, function: Work[P, R], parts: Sequence[P], on_progress: OnProgress = silent
-    ) -> Iterator[tuple[int, R]]:
-        """See ``Executor``. ValueError for fewer than one process."""
-        if self.jobs < 1:
-            raise ValueError(f"jobs = {self.jobs} is below 1. Give the number of processes.")
-        yield from _flow(_Team(min(self.jobs, max(1, len(parts)))), function, parts, pickle.dumps)
-
-
-class Ray:
-    """Tasks of a Ray cluster, one processor and one thread each; Ray gives a part to another worker if one is lost."""
-
-    def __init__(self, jobs: int | None = None) -> None:
-        self.jobs = jobs
-
-    def map(
-        self, function: Work[P, R], parts: Sequence[P], on_progress: OnProgress = silent
-    ) -> Iterator[tuple[int, R]]:
-        """See ``Executor``."""
-        from ray import cloudpickle
-
-        yield from _flow(_Cluster(self.jobs), function, parts, cloudpickle.dumps)
-
-
 # -- what processes and Ray share ------------------------------------------------------------------------------------
 
 
@@ -146,60 +117,66 @@ class _LostError(Exception):
         self.final = final
 
 
-class _Workers(Protocol):
-    """Workers that take parts: ``submit`` gives a handle, ``wait`` one that is done, ``result`` its result."""
+class _Workers(abc.ABC):
+    """Workers that take parts: ``_submit`` gives a handle, ``_wait`` one that is done, ``_result`` its result."""
 
-    def room(self) -> int: ...
-    def submit(self, payload: bytes) -> Any: ...
-    def wait(self, handles: Sequence[Any]) -> Any: ...
-    def result(self, handle: Any) -> tuple[str, Any]: ...
-    def close(self, handles: Sequence[Any]) -> None: ...
+    _dumps: Callable[[Any], bytes] = staticmethod(pickle.dumps)
 
+    @abc.abstractmethod
+    def _room(self) -> int: ...
+    @abc.abstractmethod
+    def _submit(self, payload: bytes) -> Any: ...
+    @abc.abstractmethod
+    def _wait(self, handles: Sequence[Any]) -> Any: ...
+    @abc.abstractmethod
+    def _result(self, handle: Any) -> tuple[str, Any]: ...
+    @abc.abstractmethod
+    def _close(self, handles: Sequence[Any]) -> None: ...
 
-def _flow(
-    workers: _Workers, function: Work[P, R], parts: Sequence[P], dumps: Callable[[Any], bytes]
-) -> Iterator[tuple[int, R]]:
-    """Keep a bounded number of parts in flight.
+    def map(
+        self, function: Work[P, R], parts: Sequence[P], on_progress: OnProgress = silent
+    ) -> Iterator[tuple[int, R]]:
+        """See ``Executor``. A bounded number of parts is in flight.
 
-    Whoever was when a worker died runs again, alone: so a part that kills its workers is told from those beside it.
-    """
-    waiting, flying = deque(range(len(parts))), dict[Any, int]()
-    deaths: dict[int, int] = {}  # of suspects: how many workers died of each
-    failed: list[tuple[int, str]] = []
-    here = os.getcwd()
-    try:
-        while waiting or flying:
-            while waiting and len(flying) < (1 if deaths else workers.room()):
-                number = waiting.popleft()
-                flying[workers.submit(dumps((here, trust.permission(), function, parts[number])))] = number
-            done = workers.wait(list(flying))
-            number = flying.pop(done)
-            try:
-                kind, result = workers.result(done)
-            except _LostError as lost:
-                if lost.final:
-                    failed.append((number, str(lost)))
+        Whoever was when a worker died runs again, alone: so a part that kills its workers is told from those beside it.
+        """
+        waiting, flying = deque(range(len(parts))), dict[Any, int]()
+        deaths: dict[int, int] = {}  # of suspects: how many workers died of each
+        failed: list[tuple[int, str]] = []
+        here = os.getcwd()
+        try:
+            while waiting or flying:
+                while waiting and len(flying) < (1 if deaths else self._room()):
+                    number = waiting.popleft()
+                    flying[self._submit(self._dumps((here, trust.permission(), function, parts[number])))] = number
+                done = self._wait(list(flying))
+                number = flying.pop(done)
+                try:
+                    kind, result = self._result(done)
+                except _LostError as lost:
+                    if lost.final:
+                        failed.append((number, str(lost)))
+                        continue
+                    again = sorted((number, *flying.values()))
+                    flying.clear()
+                    for suspect in again:
+                        deaths[suspect] = deaths.get(suspect, 0) + (len(again) == 1)
+                    if deaths[number] < ATTEMPTS:
+                        waiting.extendleft(reversed(again))
+                    else:
+                        failed.append((number, str(lost)))
+                        del deaths[number]
                     continue
-                again = sorted((number, *flying.values()))
-                flying.clear()
-                for suspect in again:
-                    deaths[suspect] = deaths.get(suspect, 0) + (len(again) == 1)
-                if deaths[number] < ATTEMPTS:
-                    waiting.extendleft(reversed(again))
+                deaths.pop(number, None)
+                if kind == "done":
+                    yield number, result
+                elif kind == "storage" or (len(parts) == 1 and isinstance(result, Exception)):
+                    raise result
                 else:
-                    failed.append((number, str(lost)))
-                    del deaths[number]
-                continue
-            deaths.pop(number, None)
-            if kind == "done":
-                yield number, result
-            elif kind == "storage" or (len(parts) == 1 and isinstance(result, Exception)):
-                raise result
-            else:
-                failed.append((number, _reason(result) if isinstance(result, Exception) else result))
-    finally:
-        workers.close(list(flying))
-    _raise(failed, parts)
+                    failed.append((number, _reason(result) if isinstance(result, Exception) else result))
+        finally:
+            self._close(list(flying))
+        _raise(failed, parts)
 
 
 def _work(payload: bytes) -> tuple[str, Any]:
@@ -257,17 +234,22 @@ def _heard(on_progress: OnProgress, stopped: list[BaseException]) -> OnProgress:
 # -- processes -------------------------------------------------------------------------------------------------------
 
 
-class _Team:
-    """A pool of processes that is set up anew where one of them died."""
+class Processes(_Workers):
+    """Processes of this machine, one thread each; where one dies all are set up anew, and their parts done again.
+
+    ValueError for fewer than one process.
+    """
 
     def __init__(self, jobs: int) -> None:
+        if jobs < 1:
+            raise ValueError(f"jobs = {jobs} is below 1. Give the number of processes.")
         self.jobs = jobs
         self._pool: Any = None
 
-    def room(self) -> int:
+    def _room(self) -> int:
         return PER_WORKER * self.jobs
 
-    def submit(self, payload: bytes) -> Any:
+    def _submit(self, payload: bytes) -> Any:
         import multiprocessing
         from concurrent.futures import ProcessPoolExecutor
         from concurrent.futures.process import BrokenProcessPool
@@ -279,25 +261,25 @@ class _Team:
         try:
             return self._pool.submit(_work, payload)
         except BrokenProcessPool:
-            self.close()
-            return self.submit(payload)
+            self._close()
+            return self._submit(payload)
 
-    def wait(self, handles: Sequence[Any]) -> Any:
+    def _wait(self, handles: Sequence[Any]) -> Any:
         from concurrent.futures import FIRST_COMPLETED, wait
 
         done = wait(handles, return_when=FIRST_COMPLETED).done
         return next(handle for handle in handles if handle in done)
 
-    def result(self, handle: Any) -> tuple[str, Any]:
+    def _result(self, handle: Any) -> tuple[str, Any]:
         from concurrent.futures import BrokenExecutor
 
         try:
             return handle.result()
         except BrokenExecutor:
-            self.close()
+            self._close()
             raise _LostError(f"the process that worked on it died {ATTEMPTS} times", False) from None
 
-    def close(self, handles: Sequence[Any] = ()) -> None:
+    def _close(self, handles: Sequence[Any] = ()) -> None:
         """End all processes at once: unfinished parts are done again by a later run."""
         if self._pool is None:
             return
@@ -374,31 +356,35 @@ def _answers(address: str) -> None:
         raise OSError("what answers there is not Ray")
 
 
-class _Cluster:
-    """Workers of a Ray cluster, which may become more or fewer while the work lasts."""
+class Ray(_Workers):
+    """Tasks of a Ray cluster, one processor and one thread each; Ray gives a part to another worker if one is lost.
 
-    def __init__(self, jobs: int | None) -> None:
+    The cluster may grow and shrink while the work lasts.
+    """
+
+    def __init__(self, jobs: int | None = None) -> None:
         import ray
+        from ray import cloudpickle
 
-        self.jobs, self._ray = jobs, ray
+        self.jobs, self._ray, self._dumps = jobs, ray, cloudpickle.dumps
         self._task = ray.remote(num_cpus=1, max_retries=ATTEMPTS)(_work)
 
-    def room(self) -> int:
+    def _room(self) -> int:
         return PER_WORKER * (self.jobs or max(1, int(self._ray.cluster_resources().get("CPU", 1))))
 
-    def submit(self, payload: bytes) -> Any:
+    def _submit(self, payload: bytes) -> Any:
         return self._task.remote(payload)
 
-    def wait(self, handles: Sequence[Any]) -> Any:
+    def _wait(self, handles: Sequence[Any]) -> Any:
         return self._ray.wait(list(handles), num_returns=1)[0][0]
 
-    def result(self, handle: Any) -> tuple[str, Any]:
+    def _result(self, handle: Any) -> tuple[str, Any]:
         try:
             return self._ray.get(handle)
         except self._ray.exceptions.RayError as error:
             words = f"the worker or node that worked on it was lost ({type(error).__name__})"
             raise _LostError(words, True) from None
 
-    def close(self, handles: Sequence[Any]) -> None:
+    def _close(self, handles: Sequence[Any]) -> None:
         for handle in handles:
             self._ray.cancel(handle, force=True)
