@@ -1,7 +1,7 @@
 """Calibration: from episodes to fitted parameters with standard errors, interruptible and resumable."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -25,6 +25,8 @@ from idm_env.simulator import Simulator
 from idm_env.validation import one_of
 
 Method = Literal["lm", "adam"]
+STEPS, RATES = 500, (0.1, 0.01)
+"""Of Adam: how many, and the learning rate at the first and at the last."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,50 +165,19 @@ def _defaults(problem: Problem, names: Sequence[str]) -> Tensor:
 def _adam(
     problem: Problem, own: Tensor, shared: Tensor, saved: storage.Store, on_progress: OnProgress | None
 ) -> tuple[Tensor, Tensor, Tensor, int]:
-    steps = 500
+    """Minimise the mean squared residual over all groups at once, on the real line behind the bounds.
 
-    def on_step(step: int, value: float, state: dict[str, Any]) -> None:
-        if step % 10 == 0 or step == steps:
-            saved.put("adam", state)
-        if on_progress is not None:
-            on_progress("adam", step, steps, value**0.5)
-
-    own, shared, _ = adam(problem, own, shared, steps=steps, state=saved.get("adam"), on_step=on_step)
-    problem.simulate(problem.rows(own, shared))  # NaN has no inverse, and is told by whose it is
-    # Adam has no test of its own: a Gauss–Newton step that would gain more than 1 % says that it has not arrived.
-    now = normal(problem, own[None], shared[None])
-    gain = torch.einsum("gp,gpq,gq->g", now.gradient[0], torch.linalg.pinv(now.hessian[0]), now.gradient[0])
-    return own, shared, gain <= 0.01 * now.cost[0], steps
-
-
-def adam(
-    problem: Problem,
-    own: Tensor,
-    shared: Tensor,
-    *,
-    steps: int = 500,
-    rate: tuple[float, float] = (0.1, 0.01),
-    state: dict[str, Any] | None = None,
-    on_step: Callable[[int, float, dict[str, Any]], None] | None = None,
-) -> tuple[Tensor, Tensor, float]:
-    """Minimise the mean squared residual; return own [G, P] and shared [Q] values and the last loss.
-
-    Every parameter lives on the real line behind ``biject_to`` of its bounds; the learning rate falls linearly from
-    ``rate[0]`` to ``rate[1]``. ``state`` is what ``on_step`` was given last: with it an interrupted run goes on as
-    if nothing had happened.
+    The rate falls linearly from ``RATES[0]`` to ``RATES[1]``. An interrupted run goes on as if it had not stopped.
     """
-    free = [
-        unconstrain(p, own[:, i]) if i < len(problem.own) else unconstrain(p, shared[i - len(problem.own)])
-        for i, p in enumerate(problem.parameters)
-    ]
-    leaves = [x.clone().requires_grad_() for x in free]
-    optimiser = torch.optim.Adam(leaves, lr=rate[0])
-    schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, rate[1] / rate[0], total_iters=steps)
+    start = (*own.unbind(-1), *shared)
+    leaves = [unconstrain(p, x).clone().requires_grad_() for p, x in zip(problem.parameters, start, strict=True)]
+    optimiser = torch.optim.Adam(leaves, lr=RATES[0])
+    schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, RATES[1] / RATES[0], total_iters=STEPS)
     begin = 0
-    if state is not None:
+    if (state := saved.get("adam")) is not None:
         with torch.no_grad():
-            for leaf, saved in zip(leaves, state["leaves"], strict=True):
-                leaf.copy_(saved)
+            for leaf, value in zip(leaves, state["leaves"], strict=True):
+                leaf.copy_(value)
         optimiser.load_state_dict(state["optimiser"])
         schedule.load_state_dict(state["schedule"])
         begin = state["step"]
@@ -214,29 +185,26 @@ def adam(
     def values() -> tuple[Tensor, Tensor]:
         inside = [constrain(p, x) for p, x in zip(problem.parameters, leaves, strict=True)]
         cut = len(problem.own)
-        own_now = torch.stack(inside[:cut], dim=-1)
-        return own_now, torch.stack(inside[cut:]) if inside[cut:] else shared
+        return torch.stack(inside[:cut], dim=-1), torch.stack(inside[cut:]) if inside[cut:] else shared
 
-    loss_value = float("nan")
-    count = problem.weight.sum() * (2 if problem.objective == "both" else 1)
-    for step in range(begin, steps):
+    for step in range(begin + 1, STEPS + 1):
         optimiser.zero_grad()
         residual = problem.residual(problem.simulate(problem.rows(*values())))
-        loss = residual.square().sum() / count
-        loss_value = float(loss.detach())
+        loss = residual.square().sum() / problem.samples.sum()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         schedule.step()
-        if on_step is not None:
-            saved = {
-                "leaves": [x.detach().clone() for x in leaves],
-                "optimiser": optimiser.state_dict(),
-                "schedule": schedule.state_dict(),
-                "step": step + 1,
-            }
-            on_step(step + 1, loss_value, saved)
-    own_end, shared_end = values()
-    return own_end.detach(), shared_end.detach(), loss_value
+        if step % 10 == 0:
+            now = {"optimiser": optimiser.state_dict(), "schedule": schedule.state_dict(), "step": step}
+            saved.put("adam", {"leaves": [x.detach() for x in leaves], **now})
+        if on_progress is not None:
+            on_progress("adam", step, STEPS, float(loss.detach()) ** 0.5)
+    own, shared = (x.detach() for x in values())
+    problem.simulate(problem.rows(own, shared))  # NaN has no inverse, and is told by whose it is
+    # A Gauss–Newton step from here would gain less than a hundredth of the cost.
+    end = normal(problem, own[None], shared[None])
+    gain = torch.einsum("gp,gpq,gq->g", end.gradient[0], torch.linalg.pinv(end.hessian[0]), end.gradient[0])
+    return own, shared, gain <= 0.01 * end.cost[0], STEPS
 
 
 def _levenberg(
