@@ -1,6 +1,7 @@
 """The command ``fit --lane-changes``: a file with lanes in, MOBIL's parameters and held-out likelihoods out."""
 
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -8,17 +9,17 @@ import numpy as np
 import torch
 
 from idm_env.data import DataError, Trajectories
-from idm_env.effects import IDM, Brakes, Mobil, base_named
+from idm_env.effects import Brakes, Mobil, base_named
 from idm_env.fitting import discrete_choice
 from idm_env.fitting.lane_decisions import Decisions, recorded_decisions
-from idm_env.fitting.options import Source
+from idm_env.fitting.options import Source, saved_model
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, silent
-from idm_env.model_file import Model, load_model, save_model
+from idm_env.model_file import Model, save_model
 from idm_env.parameters import replaced
 from idm_env.reports import page
 from idm_env.roads import Lanes
-from idm_env.types import Command, Params, Record
+from idm_env.types import Command, Record
 
 WRITTEN = ("model.yaml", "report.json", "report.html")
 """What ``fit_lane_changes`` writes."""
@@ -118,27 +119,15 @@ def lane_changes(
 
 def _model(options: ChangeOptions) -> Model:
     """Return the model that judges, with MOBIL where it has no effect that changes lanes."""
-    if options.model is not None and options.base is not None:
-        raise ValueError(f"base = '{options.base}', and the model {options.model} has one. Leave one of them out.")
-    if options.model is not None:
-        model = load_model(Path(options.model))
-    else:
-        model = Model((base_named(options.base) if options.base else IDM(), Brakes()))
+    model = saved_model(options.model, options.base) or Model((base_named(options.base or "idm"), Brakes()))
     effects = tuple(e for e in model.effects if e.takes not in (Command, Record) and e.name != Mobil.kind)
     return replace(model, effects=(*effects, Mobil(every=options.every)))
 
 
 def _params_of(model: Model) -> Any:
     """Return a function of ``"run/vehicle"``: the driver's own parameters where the model knows him."""
-    cache: dict[str | None, Params] = {}
-
-    def params(vehicle: str) -> Params:
-        key = vehicle if model.by == "driver" and vehicle in model.drivers else None
-        if key not in cache:
-            cache[key] = model.params(key, dtype=torch.float64)
-        return cache[key]
-
-    return params
+    params = cache(partial(model.params, dtype=torch.float64))
+    return lambda vehicle: params(vehicle if model.by == "driver" and vehicle in model.drivers else None)
 
 
 def fit_lane_changes(

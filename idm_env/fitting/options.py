@@ -81,14 +81,19 @@ class Options:
         That is the car-following law ``base`` (None: IDM), or a saved model, whose effects are kept.
         ValueError for a law beside a model that has one.
         """
-        if self.model is None:
+        saved = saved_model(self.model, self.base)
+        if saved is None:
             return base_simulator(base=base_named(self.base or "idm"), integration=self.integration), {}
-        if self.base is not None:
-            raise ValueError(f"base = '{self.base}', and the model {self.model} has one. Leave one of them out.")
-        saved = load_model(Path(self.model))
         simulator = Simulator(Lane(), behind_records(saved), dt=saved.dt, integration=saved.integration)
         others = {effect: own for effect, own in saved.parameters.items() if effect != simulator.base.name}
         return simulator, {f"{effect}.{name}": float(x) for effect, own in others.items() for name, x in own.items()}
+
+
+def saved_model(model: str | None, base: str | None) -> Model | None:
+    """Return the model of a file, None where none is named. ValueError where a law is named beside it."""
+    if model is not None and base is not None:
+        raise ValueError(f"base = '{base}', and the model {model} has one. Leave one of them out.")
+    return None if model is None else load_model(Path(model))
 
 
 def behind_records(model: Model) -> tuple[Effect, ...]:
