@@ -12,7 +12,7 @@ from typing import Any
 import polars as pl
 import torch
 
-from idm_env.data import DataError, Episode, Repair, Trajectories
+from idm_env.data import DataError, Episode, Repair
 from idm_env.data.errors import Counted
 from idm_env.data.fingerprint import marks
 from idm_env.data.folder import FolderSlice
@@ -78,20 +78,19 @@ def _fit_piece(piece: Piece, on_progress: OnProgress) -> None:
     if isinstance(piece.data, FolderSlice):
         try:
             trajectories = piece.source.trajectories(piece.data)
-            items = piece.source.episodes(trajectories)
+            chosen = piece.source.episodes(trajectories)
         except DataError as wrong:
             parts.finish(number, {"lost": str(wrong), "share": str(piece.data)})
             return
-        summary = _summary(trajectories, items.left_out)
-        summary["tracks"] = marks(trajectories, [(e.run_id, e.vehicle_id) for e in items])
-        data: Sequence[Episode] = items
-    else:
-        data = piece.data
+        data = {k: v for k, v in trajectories.summary().items() if k not in ("source", "repairs")}
+        summary = {"data": data, "repairs": trajectories.repairs, "left_out": chosen.left_out}
+        summary["tracks"] = marks(trajectories, [(e.run_id, e.vehicle_id) for e in chosen])
+    items = piece.data if isinstance(piece.data, Sequence) else chosen
     simulator, fixed = options.simulator()
     names = ("objective", "relative", "loss", "method", "starts", "seed", "substeps")
     how: dict[str, Any] = {name: getattr(options, name) for name in names}
     how |= {"checkpoint": piece.checkpoint, "resume": piece.resume, "on_progress": on_progress}
-    result = fit(data, by=piece.by, simulator=simulator, fixed=fixed, **how)
+    result = fit(items, by=piece.by, simulator=simulator, fixed=fixed, **how)
     on_progress("errors", 0, 0, "in free simulation")
     error, simulated = errors(result.problem, result.own, result.shared)
     parts.write(number, PARAMETERS, pl.DataFrame(result.table()))
@@ -102,18 +101,7 @@ def _fit_piece(piece: Piece, on_progress: OnProgress) -> None:
         figures = [pictures.examples(result.problem, error, simulated), pictures.residuals(result.problem, simulated)]
         figures += pictures.space_time(result.problem, simulated)
     summary |= {"iterations": result.iterations, "converged": int(result.converged.sum())}
-    blocks = [{"text": b.text, "image": b.image, "narrow": b.narrow} for b in figures]
-    parts.finish(number, {**summary, "dt": result.problem.batch.dt, "pictures": blocks})
-
-
-def _summary(trajectories: Trajectories, left_out: Sequence[Repair]) -> dict[str, Any]:
-    """Return the counts of a part of a folder, so that all of them can be added up."""
-
-    def plain(repairs: Sequence[Repair]) -> list[list[Any]]:
-        return [[r.kind, r.count, r.text] for r in repairs]
-
-    data = {k: v for k, v in trajectories.summary().items() if k not in ("source", "repairs")}
-    return {"data": data, "repairs": plain(trajectories.repairs), "left_out": plain(left_out)}
+    parts.finish(number, {**summary, "dt": result.problem.batch.dt, "pictures": figures})
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +127,7 @@ class JoinedFit:
     @property
     def pictures(self) -> list[page.Block]:
         """Measured against simulated, residuals, and space and time, of the first piece that has them."""
-        return [page.Block("figure", **block) for summary in self.summaries for block in summary["pictures"]]
+        return [page.Block(**block) for summary in self.summaries for block in summary["pictures"]]
 
 
 def join(parts: Parts, options: Options) -> JoinedFit:
@@ -164,8 +152,8 @@ def account_of(joined: JoinedFit, source: str) -> dict[str, Any]:
     data = [summary["data"] for summary in joined.summaries]
     repairs, left_out = Counted(), Counted()
     for summary in joined.summaries:
-        repairs.add([Repair(*one) for one in summary["repairs"]])
-        left_out.add([Repair(*one) for one in summary["left_out"]])
+        repairs.add([Repair(**one) for one in summary["repairs"]])
+        left_out.add([Repair(**one) for one in summary["left_out"]])
     left_out.add([Repair("part", 1, f"{summary['share']} left out: {summary['lost']}") for summary in joined.lost])
     sums = ("rows", "runs", "vehicles", "followers", "vehicle_seconds")
     return {

@@ -116,7 +116,7 @@ def _predict_file(job: _Job, progress: OnProgress) -> None:
     scores: list[dict[str, Any]] = []
     tables: list[pl.DataFrame] = []
     rows: list[dict[str, Any]] = []
-    pictures: list[dict[str, str]] = []
+    pictures: list[page.Block] = []
     scenario_count = 0
     for scenario in _readable(job.path, left_out):
         progress("predict", job.before + scenario_count, job.everything, job.path.name)
@@ -134,8 +134,7 @@ def _predict_file(job: _Job, progress: OnProgress) -> None:
                 by_method = {name: asdict(score(case)) for name, case in cases.items()}
                 scores.append({"scene": scenario.id, "methods": by_method})
             if len(pictures) < MOST_PICTURES:
-                block = page.picture(*scene_picture(scenario, ours))
-                pictures.append({"text": block.text, "image": block.image})
+                pictures.append(page.picture(*scene_picture(scenario, ours)))
     job.parts.write(job.number, "predictions", pl.concat(tables or [pl.DataFrame(schema=SCHEMA)]))
     job.parts.write(job.number, "parameters", pl.DataFrame(rows, schema=PARAMETERS))
     counts = {"scenarios": scenario_count, "agents": len(tables), "scores": scores, "left_out": left_out}
@@ -219,7 +218,7 @@ def _report(parts: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], list[page.
 
     left_out = [item for part in parts for item in part["left_out"]]
     bad = [item["file"] for item in left_out if "file" in item]
-    pictures = [page.Block("figure", **item) for part in parts for item in part["pictures"]]
+    pictures = [page.Block(**item) for part in parts for item in part["pictures"]]
     return {
         "scenarios": sum(part["scenarios"] for part in parts),
         "agents": sum(part["agents"] for part in parts),
