@@ -215,10 +215,7 @@ class Compiled(Simulator):
 
 def stacked(values: Sequence[Any]) -> Any:
     """Return inputs of single steps as one input with a leading time dimension."""
-    if isinstance(values[0], Tensor):
-        return torch.stack(tuple(values))
-    columns = zip(*values, strict=True)
-    return type(values[0])(*(None if column[0] is None else torch.stack(column) for column in columns))
+    return mapped(lambda *steps: torch.stack(steps), *values)
 
 
 def _unbind(value: Any) -> list[Any]:

@@ -90,16 +90,13 @@ class Pieces:
         self._length = frame["length_m"].to_numpy()
         self.vehicles = table.vehicles()
 
-    def of_vehicles(self, vehicles: list[tuple[str, str, int, int]]) -> Iterator[TrackPiece]:
-        """Yield the tracks of some vehicles, as ``vehicles`` lists them."""
-        for run, vehicle, first, count in vehicles:
+    def __iter__(self) -> Iterator[TrackPiece]:
+        """Yield the tracks of all vehicles."""
+        for run, vehicle, first, count in self.vehicles:
             rows = slice(first, first + count)
             time, position, length = self._time[rows], self._position[rows], float(self._length[first])
             whole = TrackPiece(run, vehicle, 0, time, position, length, self._leader[rows], self._lane[rows])
             yield from self._usable(whole)
-
-    def __iter__(self) -> Iterator[TrackPiece]:
-        return self.of_vehicles(self.vehicles)
 
     def _usable(self, whole: TrackPiece) -> Iterator[TrackPiece]:
         name = f"{whole.run_id}/{whole.vehicle_id}"
