@@ -13,6 +13,7 @@ from functools import cached_property
 
 from idm_env.compiled.scalar.derive import adjoint
 from idm_env.compiled.scalar.graph import CONSTANT, DYNAMIC, STATIC, Leaf, Node, hoisted, inputs_of, ordered, replaced
+from idm_env.compiled.scalar.program import recalled
 from idm_env.compiled.scalar.record import Recording, Untraceable
 
 OWN = ("gap", "speed", "position", "accel")
@@ -67,12 +68,12 @@ class DriverProgram:
         self._accel, sense = nodes[0], nodes[1 + len(names) :]
         self._respond = dict(zip(names, nodes[1:], strict=False))
         after = self._closure(sense)
-        self.seen: list[tuple[int, int]] = []
-        self.agos: list[Node] = []
-        looks = self._looks([*after.values(), self._accel])
+        (*self._after, self._accel), looks, self.agos = recalled(graph, [*after.values(), self._accel], "past {number}")
+        if changing := next((steps for steps in self.agos if steps.level == DYNAMIC), None):
+            raise Untraceable(f"effect '{changing.note}' looks back by a time that changes under way")
+        self.seen = [(look.signal, look.ago) for look in looks]
         used = sorted({signal for signal, _ in self.seen})
-        self._names, self._after = list(after), replaced(graph, list(after.values()), looks)
-        (self._accel,) = replaced(graph, [self._accel], looks)
+        self._names = list(after)
         self._sense = [sense[i] for i in used]
         self.signals = tuple(used)
         cut, self.hoist = hoisted(graph, [*self._after, *self._sense])
@@ -128,22 +129,6 @@ class DriverProgram:
             elif slot.name == "displacement":
                 moved[node] = graph.sub(graph.input("position after", slot.shift), graph.input("position", slot.shift))
         return replaced(graph, [close], moved)[0]
-
-    def _looks(self, nodes: Sequence[Node]) -> dict[Node, Node]:
-        """Return every look at the past as a row that the loop fills."""
-        rows: dict[Node, Node] = {}
-        for node in ordered(nodes):
-            if node.op != "past":
-                continue
-            steps = node.args[0]
-            if steps.level == DYNAMIC:
-                raise Untraceable(f"effect '{node.note}' looks back by a time that changes under way")
-            if steps not in self.agos:
-                self.agos.append(steps)
-            assert isinstance(node.label, int)
-            rows[node] = self.graph.input(f"past {len(self.seen)}")
-            self.seen.append((node.label, self.agos.index(steps)))
-        return rows
 
     # -- what there is -------------------------------------------------------------------------------------------
 

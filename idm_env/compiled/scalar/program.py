@@ -57,7 +57,7 @@ class Program:
             respond["step"] = graph.add(graph.input("step"), graph.constant(1.0))
         names = [f"{phase} {name}" for phase, nodes in (("respond", respond), ("close", close)) for name in nodes]
         nodes = [*recording.sense, *respond.values(), *close.values()]
-        nodes, self.recalls, times = _recalled(graph, nodes)
+        nodes, self.recalls, times = recalled(graph, nodes)
         cut, self.hoist = hoisted(graph, [*nodes, *times])
         self.recall = cut[len(nodes) :]
         self.sense = cut[: len(recording.sense)]
@@ -189,8 +189,13 @@ class Program:
             states = more
 
 
-def _recalled(graph: Graph, nodes: list[Node]) -> tuple[list[Node], list[Recall], list[Node]]:
-    """Put inputs in place of the signals of the past; return them with what is looked up, and how long ago each is."""
+def recalled(
+    graph: Graph, nodes: list[Node], name: str = "recalled {signal} of {ago}"
+) -> tuple[list[Node], list[Recall], list[Node]]:
+    """Put inputs in place of the signals of the past; return them with what is looked up, and how long ago each is.
+
+    ``name`` names an input by its ``signal``, by how long ``ago`` it is, or by its ``number``.
+    """
     times: list[Node] = []
     recalls: list[Recall] = []
     places: dict[Node, Node] = {}
@@ -200,7 +205,7 @@ def _recalled(graph: Graph, nodes: list[Node]) -> tuple[list[Node], list[Recall]
             if node.args[0] not in times:
                 times.append(node.args[0])
             ago = times.index(node.args[0])
-            slot = Leaf(f"recalled {node.label} of {ago}")
+            slot = Leaf(name.format(signal=node.label, ago=ago, number=len(recalls)))
             places[node] = graph.input(slot.name)
             recalls.append(Recall(slot, ago, node.label))
     return replaced(graph, nodes, places), recalls, times
