@@ -68,11 +68,6 @@ class Scenario:
     controls: tuple[TrafficControl, ...] = ()
     notes: tuple[str, ...] = field(default=())
 
-    @property
-    def steps(self) -> int:
-        """Steps of history, present and future."""
-        return len(self.agents[0].valid)
-
 
 def check_scenario(agents: tuple[Agent, ...], targets: tuple[int, ...], present: int, source: str) -> None:
     """Raise DataError for tracks to predict that do not exist, and for a scenario that ends before its present."""

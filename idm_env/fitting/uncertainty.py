@@ -16,11 +16,10 @@ ENOUGH_ROWS = 10
 
 
 class Uncertainty(NamedTuple):
-    """Per group: covariance [G, N, N], standard errors [G, N], effective samples [G], and flags [G, N]."""
+    """Per group: covariance [G, N, N], standard errors [G, N], and flags [G, N]."""
 
     covariance: Tensor
     standard_error: Tensor
-    effective_samples: Tensor
     at_bound: Tensor
     identified: Tensor
 
@@ -95,8 +94,7 @@ def uncertainty(problem: Problem, own: Tensor, shared: Tensor) -> Uncertainty:
     at_bound = ((value - low).abs() <= 1e-3 * (high - low)) | ((value - high).abs() <= 1e-3 * (high - low))
     strength = torch.tensor([p.null is not None for p in problem.parameters])
     limit = torch.where(strength, 0.25 * (high - low), 0.5 * value.abs())
-    total = own.new_zeros(groups).index_add(0, problem.group, independent)
-    return Uncertainty(covariance, error, total, at_bound, error < limit)
+    return Uncertainty(covariance, error, at_bound, error < limit)
 
 
 def integration_error(problem: Problem, own: Tensor, shared: Tensor) -> Tensor:

@@ -71,12 +71,11 @@ class RealLeader(Effect):
 
 @dataclass(frozen=True, eq=False)
 class Imitated:
-    """Result for one track: motion [K], the five values, imagined gap (m) and closing speed (m/s) [K], final loss."""
+    """Result for one track: motion [K], the five values, imagined gap [K] (m), final loss."""
 
     motion: RegularMotion
     values: np.ndarray
     gap: np.ndarray
-    closing_speed: np.ndarray
     loss: float
 
 
@@ -123,10 +122,9 @@ def _imitated(
         own = slice(0, len(clock))
         # The acceleration of a step starts at its own speed.
         position, speed, accel = driven.position[own, i], driven.speed[own, i], driven.accel[1:][own, i]
-        imagined = driven.inputs["imagined.gap"][own, i], driven.inputs["imagined.closing_speed"][own, i]
         loss = float(np.abs(position[steps[i]] - targets[i]).mean())
         motion = RegularMotion(clock, position + track.position_m[0], speed, accel)
-        fits.append(Imitated(motion, values[i], *imagined, loss))
+        fits.append(Imitated(motion, values[i], driven.inputs["imagined.gap"][own, i], loss))
     return fits
 
 

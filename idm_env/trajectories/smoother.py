@@ -122,13 +122,12 @@ class TrackObservations:
 
 @dataclass(eq=False)
 class Smoothed:
-    """Position, speed and acceleration per step [K] with their standard deviations [K, 3], and the likelihood."""
+    """Position, speed and acceleration per step [K] with their standard deviations [K, 3]."""
 
     position: np.ndarray
     speed: np.ndarray
     accel: np.ndarray
     sigma: np.ndarray
-    likelihood: float
 
 
 def log_likelihood(observed: TrackObservations, noise: PositionNoise, inflated: np.ndarray | None = None) -> float:
@@ -156,7 +155,7 @@ def smooth(observed: TrackObservations, noise: PositionNoise, options: SmootherO
             observed = observed.bounded(steps, which, np.full(len(steps), value))
         mean, cov, push = _fitted(observed, noise, options, push)
     sigma = np.sqrt(np.maximum(np.einsum("kii->ki", cov)[:, :3], 0.0))
-    return Smoothed(mean[:, 0] + observed.origin, mean[:, 1], mean[:, 2], sigma, log_likelihood(observed, noise))
+    return Smoothed(mean[:, 0] + observed.origin, mean[:, 1], mean[:, 2], sigma)
 
 
 def _broken(mean: np.ndarray, options: SmootherOptions) -> list[tuple[np.ndarray, int, float]]:
