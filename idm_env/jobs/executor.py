@@ -120,7 +120,8 @@ class _LostError(Exception):
 class _Workers(abc.ABC):
     """Workers that take parts: ``_submit`` gives a handle, ``_wait`` one that is done, ``_result`` its result."""
 
-    _dumps: Callable[[Any], bytes] = staticmethod(pickle.dumps)
+    def _dumps(self, content: Any) -> bytes:
+        return pickle.dumps(content)
 
     @abc.abstractmethod
     def _room(self) -> int: ...
@@ -364,10 +365,14 @@ class Ray(_Workers):
 
     def __init__(self, jobs: int | None = None) -> None:
         import ray
+
+        self.jobs, self._ray = jobs, ray
+        self._task = ray.remote(num_cpus=1, max_retries=ATTEMPTS)(_work)
+
+    def _dumps(self, content: Any) -> bytes:
         from ray import cloudpickle
 
-        self.jobs, self._ray, self._dumps = jobs, ray, cloudpickle.dumps
-        self._task = ray.remote(num_cpus=1, max_retries=ATTEMPTS)(_work)
+        return cloudpickle.dumps(content)
 
     def _room(self) -> int:
         return PER_WORKER * (self.jobs or max(1, int(self._ray.cluster_resources().get("CPU", 1))))
