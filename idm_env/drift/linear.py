@@ -55,7 +55,6 @@ class LinearSteps:
     ``by_state`` [T − 1, rows, 2, 2] by gap and speed, ``by_level`` [T − 1, rows, 2, p + k] by levels of the step.
     """
 
-    path: Path
     to: np.ndarray
     by_state: np.ndarray
     by_level: np.ndarray
@@ -121,7 +120,7 @@ class MeasuredDrivers:
             to += (high + low - 2.0 * middle) / 6.0
             slope = (high - low) / (2.0 * np.maximum(off, NARROW))[..., None]
             by_level[..., slot] = np.where(off[..., None] > NARROW, slope, by_level[..., slot])
-        return LinearSteps(path, to, both(slice(0, 2)), by_level)
+        return LinearSteps(to, both(slice(0, 2)), by_level)
 
     def _stepped(self, path: Path, gap: Tensor, speed: Tensor, level: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Return gap and speed after a step from every sample but the last."""

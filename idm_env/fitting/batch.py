@@ -6,9 +6,8 @@ effects need. Rows of unequal length are padded; ``valid`` tells the samples tha
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,24 +100,6 @@ class Batch:
     def step(self) -> float:
         """Step of the simulation (s)."""
         return self.dt / self.substeps
-
-    def rows(self, index: Sequence[int]) -> Batch:
-        """Return some of the rows, without the padding that they do not need."""
-        columns = torch.as_tensor(list(index))
-        steps = max(len(self.episodes[i]) for i in index)
-        fine = (steps - 1) * self.substeps + 1
-        fields = dict.fromkeys(("gap", "speed", "valid"), steps)
-        fields |= dict.fromkeys(("position", "all_speed", "accel", "present"), fine)
-        changes = {name: getattr(self, name)[:size].index_select(1, columns) for name, size in fields.items()}
-        adjacent = [x[:fine].index_select(1, columns) for x in self.beside]
-        return dataclasses.replace(
-            self,
-            episodes=tuple(self.episodes[i] for i in index),
-            length=self.length[columns],
-            first_step=self.first_step[columns],
-            beside=(adjacent[0], adjacent[1], adjacent[2]),
-            **changes,
-        )
 
     def columns(self, simulator: Simulator) -> tuple[slice, int]:
         """Return which of the four columns a simulator needs, and the driver's place among them."""

@@ -39,7 +39,6 @@ class Fit:
     uncertainty: Uncertainty
     converged: Tensor
     iterations: int
-    method: Method
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -145,7 +144,7 @@ def fit(
         own, common, converged, count = _levenberg(
             problem, begin, starts if start is None else 1, iterations, seed, saved, on_progress
         )
-    result = Fit(problem, own, common, uncertainty(problem, own, common), converged, count, method)
+    result = Fit(problem, own, common, uncertainty(problem, own, common), converged, count)
     saved.remove()
     return result
 

@@ -39,7 +39,6 @@ class Decisions:
     chosen: Tensor
     vehicle: Tensor
     vehicles: tuple[str, ...]
-    every: float
     left_out: tuple[Repair, ...]
 
     def __len__(self) -> int:
@@ -119,7 +118,7 @@ def recorded_decisions(
         raise DataError(f"{trajectories.source}: no driver has a lane beside his own. Lane changes need several lanes.")
     left_out = [Repair(kind, n, _WORDS[kind].format(n=n)) for kind, n in lost.items() if n]
     scene, params, possible, chosen, vehicle = mapped(lambda *columns: torch.cat(columns), *parts)
-    return Decisions(scene, params, possible, chosen, vehicle, tuple(names), every, tuple(left_out))
+    return Decisions(scene, params, possible, chosen, vehicle, tuple(names), tuple(left_out))
 
 
 _WORDS = {

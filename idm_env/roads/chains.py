@@ -48,12 +48,11 @@ class Chains(Lane):
 
 @dataclass(frozen=True, eq=False)
 class _Chained(Ending, Chains):
-    road: Chains = Chains()
     places: Places | None = None
     position: Tensor | None = None
 
     def __init__(self, road: Chains, places: Places, position: Tensor) -> None:
-        for name, value in (("closed", road.closed), ("road", road), ("places", places), ("position", position)):
+        for name, value in (("closed", road.closed), ("places", places), ("position", position)):
             object.__setattr__(self, name, value)
 
     def led(self, x: Tensor) -> Tensor:
