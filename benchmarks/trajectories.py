@@ -171,7 +171,7 @@ def filtering(part: tuple[Path, int], _: OnProgress = silent) -> str:
     """Return scores on the half that tuned nothing, with the ends of the tracks and without; (data, which half)."""
     data, number = part
     truth = truth_of(pl.read_parquet(data / CLEAN), with_run=False)
-    first, second = halves(list(Pieces(read_table(data / RAW))))
+    first, second = halves(list(Pieces(read_table(data / RAW)[0])))
     tuned, scored = (first, second) if number == 1 else (second, first)
     noise = fit_noise([(t.time_s, t.position_m) for t in tuned], 0.1)
     ours = recipe(scored, 0.1, noise)
@@ -204,7 +204,7 @@ def reconstruction(part: tuple[Path, str, float], _: OnProgress = silent) -> str
     """
     data, place, seconds = part
     file, count, shortest = FILES[place]
-    long = [t for t in Pieces(read_table(data / file)) if t.time_s[-1] - t.time_s[0] >= shortest]
+    long = [t for t in Pieces(read_table(data / file)[0]) if t.time_s[-1] - t.time_s[0] >= shortest]
     # evenly over the file, and at most two minutes of each
     chosen = [long[i] for i in np.unique(np.linspace(0, len(long) - 1, 2 * count).astype(int))]
     both = halves([t.part(t.time_s <= t.time_s[0] + 120.0) for t in chosen])

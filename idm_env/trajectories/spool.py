@@ -20,7 +20,6 @@ from idm_env.data.load import batches
 from idm_env.data.names import Columns
 from idm_env.data.schema import TRACK, of_run
 from idm_env.jobs import storage
-from idm_env.trajectories.tracks import Table
 
 KEPT = ("run_id", "vehicle_id", "time_s", "position_m", "leader_id", "lane", "length_m", "ring_length_m", "gap_m")
 MOST_BUCKETS = 64
@@ -43,12 +42,10 @@ class Shelf:
     """Chunks of vehicles on disk, each read by one worker.
 
     Attributes:
-        source: Name of the file.
         folder: Where they are.
         borders: First vehicle of every chunk, and the number of vehicles.
     """
 
-    source: str
     folder: Path
     borders: tuple[int, ...]
 
@@ -56,15 +53,15 @@ class Shelf:
         """Return the file of one chunk."""
         return self.folder / f"chunk-{number:05d}.parquet"
 
-    def table(self, number: int) -> Table:
+    def table(self, number: int) -> pl.DataFrame:
         """Return the table of one chunk."""
-        return Table(pl.read_parquet(self.path(number), glob=False).drop("number"), self.source)
+        return pl.read_parquet(self.path(number), glob=False).drop("number")
 
-    def vehicle(self, index: int) -> Table:
+    def vehicle(self, index: int) -> pl.DataFrame:
         """Return the table of one vehicle."""
         path = self.path(bisect_right(self.borders, index) - 1)
         one = pl.scan_parquet(path, glob=False).filter(pl.col("number") == index)
-        return Table(one.drop("number").collect(), self.source)
+        return one.drop("number").collect()
 
 
 class Spool:
@@ -89,7 +86,7 @@ class Spool:
         folder.mkdir(parents=True)
         files, index = self._read(path, how)
         self.vehicles: list[tuple[str, str]] = index.select(TRACK).rows()
-        self.shelf = Shelf(self.source, folder, _borders([run for run, _ in self.vehicles], chunk))
+        self.shelf = Shelf(folder, _borders([run for run, _ in self.vehicles], chunk))
         chunks = pl.Series(self.shelf.borders[1:-1], dtype=pl.UInt32)
         index = index.with_columns(pl.lit(chunks).search_sorted(pl.col("number"), "right").alias("chunk"))
         steps = self._shelve(files, index)
@@ -109,7 +106,7 @@ class Spool:
             strands[-1].append(number) if goes_on else strands.append([number])
         return [tuple(strand) for strand in strands]
 
-    def picked(self, indices: Sequence[int]) -> Iterator[Table]:
+    def picked(self, indices: Sequence[int]) -> Iterator[pl.DataFrame]:
         """Yield the tables of single vehicles."""
         yield from map(self.shelf.vehicle, indices)
 
@@ -237,11 +234,11 @@ class Spool:
         return by_bucket
 
 
-def read_table(path: str | Path, layout: str = "auto") -> Table:
-    """Return a whole file as one table, by the rules of ``Spool``, whose DataErrors it raises."""
+def read_table(path: str | Path) -> tuple[pl.DataFrame, tuple[Repair, ...]]:
+    """Return a whole file as one table, and its repairs, by the rules of ``Spool``, whose DataErrors it raises."""
     with TemporaryDirectory() as folder:
-        spool = Spool(path, Path(folder) / "spool", 200, Reading(layout))
-        return Table(pl.concat([spool.shelf.table(n).frame for n in range(spool.chunks)]), spool.source, spool.repairs)
+        spool = Spool(path, Path(folder) / "spool", 200)
+        return pl.concat([spool.shelf.table(n) for n in range(spool.chunks)]), spool.repairs
 
 
 def _joined(

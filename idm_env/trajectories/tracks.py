@@ -12,8 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 import polars as pl
 
-from idm_env.data import Repair
-from idm_env.data.schema import spans
+from idm_env.data.schema import TRACK, spans
 
 REVERSED_M = 3.0
 """A vehicle whose smoothed position falls by more than this drives backwards, which the simulator never does (m)."""
@@ -56,46 +55,30 @@ class TrackPiece:
         return dataclasses.replace(self, piece=self.piece if piece is None else piece, **cut)
 
 
-@dataclasses.dataclass(frozen=True)
-class Table:
-    """Rows of vehicles, each sorted by time, with ``leader_id`` ("" for none) and a length; what was repaired."""
-
-    frame: pl.DataFrame
-    source: str
-    repairs: tuple[Repair, ...] = ()
-
-    def vehicles(self) -> list[tuple[str, str, int, int]]:
-        """Return (run, vehicle, first row, rows) of every vehicle, in order of the time at which it appears."""
-        rows = self.frame.with_row_index("row").group_by("run_id", "vehicle_id", maintain_order=True)
-        table = rows.agg(pl.col("row").first(), pl.len().alias("count"), pl.col("time_s").first().alias("begin"))
-        return table.sort("run_id", "begin", maintain_order=True).select("run_id", "vehicle_id", "row", "count").rows()
-
-
 class Pieces:
     """Tracks of a table, in the order in which vehicles appear; ``left_out`` counts what could not be used.
 
-    ``bridge`` (s) is the longest hole that stays inside a track; None keeps every hole (reconstruction).
+    The table has the rows of vehicles, each sorted by time, with ``leader_id`` ("" for none) and a length. ``bridge``
+    (s) is the longest hole that stays inside a track; None keeps every hole (reconstruction).
     """
 
-    def __init__(self, table: Table, bridge: float | None = 2.0) -> None:
+    def __init__(self, table: pl.DataFrame, bridge: float | None = 2.0) -> None:
         self.table = table
         self.bridge = bridge
         self.left_out: list[tuple[str, str]] = []
         self.notes: list[tuple[str, str]] = []
-        frame = table.frame
-        self._time, self._position = (frame[name].to_numpy() for name in ("time_s", "position_m"))
-        self._leader = frame["leader_id"].to_numpy()
-        nowhere = np.full(frame.height, -1, np.int64)
-        self._lane = frame["lane"].fill_null(-1).to_numpy() if "lane" in frame.columns else nowhere
-        self._length = frame["length_m"].to_numpy()
-        self.vehicles = table.vehicles()
 
     def __iter__(self) -> Iterator[TrackPiece]:
         """Yield the tracks of all vehicles."""
-        for run, vehicle, first, count in self.vehicles:
-            rows = slice(first, first + count)
-            time, position, length = self._time[rows], self._position[rows], float(self._length[first])
-            whole = TrackPiece(run, vehicle, 0, time, position, length, self._leader[rows], self._lane[rows])
+        lane = pl.col("lane").fill_null(-1) if "lane" in self.table.columns else pl.lit(-1, pl.Int64)
+        table = self.table.with_columns(lane.alias("lane")).with_row_index("row")
+        time, position, leader, lanes = (table[n].to_numpy() for n in ("time_s", "position_m", "leader_id", "lane"))
+        first = pl.col("row", "length_m", "time_s").first()
+        vehicles = table.group_by(TRACK, maintain_order=True).agg(first, pl.len().alias("count"))
+        vehicles = vehicles.sort("run_id", "time_s", maintain_order=True)
+        for run, vehicle, begin, length, count in vehicles.select(*TRACK, "row", "length_m", "count").rows():
+            rows = slice(begin, begin + count)
+            whole = TrackPiece(run, vehicle, 0, time[rows], position[rows], length, leader[rows], lanes[rows])
             yield from self._usable(whole)
 
     def _usable(self, whole: TrackPiece) -> Iterator[TrackPiece]:

@@ -35,7 +35,7 @@ def test_chunks_end_where_runs_do_unless_a_run_is_longer(runs: Path, tmp_path: P
     spool = Spool(runs, tmp_path / "spool", 2)
     assert spool.shelf.borders == (0, 2, 4, 6, 8, 9, 11)
     assert spool.strands() == [(0,), (1,), (2, 3, 4), (5,)]
-    assert [spool.shelf.table(n).frame["vehicle_id"].n_unique() for n in range(6)] == [2, 2, 2, 2, 1, 2]
+    assert [spool.shelf.table(n)["vehicle_id"].n_unique() for n in range(6)] == [2, 2, 2, 2, 1, 2]
 
 
 def test_processes_and_folders_give_the_bytes_of_one_process_and_file(runs: Path, tmp_path: Path) -> None:

@@ -205,7 +205,7 @@ def test_drivers_are_calibrated_behind_real_leaders_only() -> None:
 
 
 def halves(path: object) -> tuple[list[TrackPiece], list[TrackPiece]]:
-    tracks = list(Pieces(read_table(path)))  # type: ignore[arg-type]
+    tracks = list(Pieces(read_table(path)[0]))  # type: ignore[arg-type]
     names = sorted({t.vehicle_id for t in tracks}, key=int)
     tuned = set(names[::2])
     return [t for t in tracks if t.vehicle_id in tuned], [t for t in tracks if t.vehicle_id not in tuned]

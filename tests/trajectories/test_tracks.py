@@ -17,7 +17,7 @@ from idm_env.trajectories.files import filter_file
 from idm_env.trajectories.spool import Spool, read_table
 from idm_env.trajectories.tracks import Pieces
 from tests.data.tables import platoon
-from tests.trajectories.tracks import read_frame
+from tests.trajectories.tracks import read_frame, read_repaired
 
 
 def rows(vehicle: str, time: np.ndarray, position: np.ndarray, **more: object) -> pl.DataFrame:
@@ -39,8 +39,8 @@ def test_one_bad_track_does_not_stop_the_others() -> None:
             rows("spike", TIME, 10 * TIME + 100.0 * (np.abs(TIME - 5) < 0.01), lane=7),
         ]
     )
-    table = read_frame(frame)
-    counts = {repair.kind: repair.count for repair in table.repairs}
+    table, repairs = read_repaired(frame)
+    counts = {repair.kind: repair.count for repair in repairs}
     assert counts["track split"] == counts["position jumps"] == 1
     pieces = Pieces(table)
     tracks = {track.key: track for track in pieces}
@@ -52,10 +52,10 @@ def test_one_bad_track_does_not_stop_the_others() -> None:
 
 def test_times_are_sorted_and_repeats_counted() -> None:
     time = np.array([0.0, 0.2, 0.1, 0.3, 0.3, 0.4])
-    table = read_frame(rows("a", time, 10 * time))
+    table, repairs = read_repaired(rows("a", time, 10 * time))
     (track,) = Pieces(table)
     assert np.allclose(track.time_s, [0.0, 0.1, 0.2, 0.3, 0.4])
-    assert {repair.kind: repair.count for repair in table.repairs} == {
+    assert {repair.kind: repair.count for repair in repairs} == {
         "time not increasing": 1, "duplicated time": 1, "length assumed": 1,
     }  # fmt: skip
 
@@ -102,7 +102,7 @@ def test_missing_rows_and_flickering_lanes_make_no_switch_of_leader(tmp_path: Pa
         flicker = (pl.int_range(pl.len()) % 41 == 7) & ~quiet
         spoilt = table.with_columns(lane=pl.when(flicker).then(1 - pl.col("lane")).otherwise("lane"))
     clean, found = read_frame(table), read_frame(spoilt)
-    assert switches(clean.frame) == switches(found.frame) == 3  # his own, and those behind him in both lanes
+    assert switches(clean) == switches(found) == 3  # his own, and those behind him in both lanes
     spoilt.write_csv(tmp_path / "spoilt.csv")
     filter_file(tmp_path / "spoilt.csv", tmp_path / "out", baselines=False)
     written = load(tmp_path / "out" / "trajectories.parquet")
@@ -125,7 +125,7 @@ def test_laps_go_on_where_the_ring_has_its_start() -> None:
 
 
 def test_measured_file_reads_whole(measured) -> None:  # type: ignore[no-untyped-def]
-    pieces = Pieces(read_table(measured("ngsim_i80_rawlike.csv.gz")))
+    pieces = Pieces(read_table(measured("ngsim_i80_rawlike.csv.gz"))[0])
     tracks = list(pieces)
     assert len({track.vehicle_id for track in tracks}) == 222
     assert len(pieces.left_out) == 0
@@ -164,7 +164,7 @@ def test_a_spool_holds_what_the_whole_table_holds(
     counts = {repair.kind: repair.count for repair in spool.repairs}
     assert counts["duplicated time"] == 3 and counts["no position"] == 1 and counts["time not increasing"] > 50
     (table,) = spool.picked([3])
-    assert table.frame["vehicle_id"].unique().to_list() == ["3"]
+    assert table["vehicle_id"].unique().to_list() == ["3"]
 
 
 def test_units_that_are_named_are_converted(tmp_path: Path) -> None:
@@ -203,7 +203,7 @@ import resource, sys
 from pathlib import Path
 from idm_env.trajectories.spool import Spool
 spool = Spool(sys.argv[1], Path(sys.argv[2]), 100)
-rows = sum(spool.shelf.table(number).frame.height for number in range(spool.chunks))
+rows = sum(spool.shelf.table(number).height for number in range(spool.chunks))
 print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 """
 

@@ -8,9 +8,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import polars as pl
 
+from idm_env.data import Repair
 from idm_env.trajectories.scores import RegularMotion
 from idm_env.trajectories.spool import read_table
-from idm_env.trajectories.tracks import Table, TrackPiece
+from idm_env.trajectories.tracks import TrackPiece
 
 
 def swinging(seconds: float = 60.0, dt: float = 0.1, phase: float = 0.0) -> RegularMotion:
@@ -33,8 +34,13 @@ def track_of(
     )
 
 
-def read_frame(frame: pl.DataFrame) -> Table:
+def read_frame(frame: pl.DataFrame) -> pl.DataFrame:
     """Return a table as filter reads it from a file."""
+    return read_repaired(frame)[0]
+
+
+def read_repaired(frame: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Repair, ...]]:
+    """Return a table as filter reads it from a file, and what was repaired."""
     with TemporaryDirectory() as folder:
         frame.write_parquet(Path(folder) / "table.parquet")
         return read_table(Path(folder) / "table.parquet")
