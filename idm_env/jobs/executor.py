@@ -16,6 +16,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import cached_property
 from typing import Any, Protocol, TypeVar
 
 from idm_env import compat
@@ -367,7 +368,10 @@ class Ray(_Workers):
         import ray
 
         self.jobs, self._ray = jobs, ray
-        self._task = ray.remote(num_cpus=1, max_retries=ATTEMPTS)(_work)
+
+    @cached_property
+    def _task(self) -> Any:
+        return self._ray.remote(num_cpus=1, max_retries=ATTEMPTS)(_work)
 
     def _dumps(self, content: Any) -> bytes:
         from ray import cloudpickle
