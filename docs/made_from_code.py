@@ -205,8 +205,6 @@ def _meaning(function: Any) -> str:
     return text.replace("``", "`").replace("|", "\\|")
 
 
-MEASURED = {"highway": "2026-11-27 (seeds 1 to 4: 2026-11-26)"}
-"""When tables of skill were measured, where not on 2026-11-27."""
 ROWS = {
     "human": "*Human* is `step(None)`.",
     "rule": "*Rule* is IDM's formula as commands, on open roads less a human's, its numbers found by returns alone.",
@@ -225,13 +223,16 @@ def _skill(name: str) -> list[str]:
     mine = [row[1:] for row in rows if row[0] == name]
     if not mine:
         return ["## Skill", "", f"Not measured yet: `python -m benchmarks.tasks {name}`.", ""]
+    from benchmarks.tasks import GIVEN
+
     told = " ".join(words for row, words in ROWS.items() if row in {line[0] for line in mine})
+    with_keywords = "".join(f", `{keyword}={value}`" for keyword, value in GIVEN.get(name, {}).items())
     return [
-        "## Skill", "", "(return − human)/(best row − human), 64 fresh episodes, ± 95 % of the paired difference; none "
-        "where no row is above human.", "",
+        "## Skill", "", f"(return − human)/(best row − human), 64 fresh episodes{with_keywords}, ± 95 % of the paired "
+        "difference; none where no row is above human.", "",
         "| row | seed | return | skill | ± | crashes | CPU s |", "| --- | --- | --- | --- | --- | --- | --- |",
         *(f"| {' | '.join(row)} |" for row in mine), "",
-        f"{told} `python -m benchmarks.tasks {name}`, {MEASURED.get(name, '2026-11-27')}, one thread, no GPU.", "",
+        f"{told} `python -m benchmarks.tasks {name}`, 2026-11-27, one thread, no GPU.", "",
     ]  # fmt: skip
 
 

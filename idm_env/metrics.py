@@ -49,7 +49,8 @@ def post_encroachment_time(front: Tensor, length: Tensor, area: tuple[float, flo
 
     Where two ways cross or merge: ``front`` ``(time, …, 2)`` is each vehicle's place along its own way (m), ``area``
     where the stretch that both ways share begins and ends on it (m), ``length`` ``(…, 2)`` in metres; rows are ``dt``
-    (s) apart, between which places are linear. Below 0 both were there at once; NaN where either does not pass.
+    (s) apart, between which places are linear. Below 0 both were there at once; NaN where either does not pass. No
+    feature or reward term: it is known only when the second has come.
     B. L. Allen, B. T. Shin, P. J. Cooper 1978, "Analysis of traffic conflicts and collisions", Transportation Research
     Record 667, 67.
     """

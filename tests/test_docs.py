@@ -22,6 +22,7 @@ import polars as pl
 import pytest
 import torch
 
+from benchmarks.tasks import teaches
 from idm_env import IDM, Brakes, Lane, Replay, Simulator
 from idm_env.data import synthetic
 from idm_env.discovery.verdict import Verdict
@@ -344,3 +345,5 @@ def test_the_table_of_skill_is_of_one_measure() -> None:
         most = max((row for row in rows if row[0] == task), key=lambda row: float(row[3]))
         none = math.isnan(dict(skill)["human"])
         assert most[1] == "human" if none else dict(skill)["human"] == 0.0 and max(x for _, x in skill) == 1.0
+    for task in ("ring", "follow", "platoon", "highway"):  # docs/environments.md says so
+        assert teaches([row for row in rows if row[0] == task]), task
