@@ -213,6 +213,16 @@ def transforming() -> bool:
     return bool(torch._C._are_functorch_transforms_active())
 
 
+def tree_flatten(tree: Any) -> tuple[list[Any], Any]:
+    """Return the leaves of nested tuples and mappings, and their form: a key, which can ``unflatten`` other leaves.
+
+    Why: torch's trees, which it uses in ``torch.func`` and ``torch.cuda``, have no public name. Tried: torch 2.13.0.
+    """
+    from torch.utils import _pytree
+
+    return _pytree.tree_flatten(tree)
+
+
 def forward_mode() -> bool:
     """Return whether within ``torch.autograd.forward_ad.dual_level``.
 

@@ -277,7 +277,7 @@ def test_seven_questions_are_answered_two_clicks_from_the_readme() -> None:
     rows = re.findall(r"^\| (.+\?) \| \[.+\]\(([^)#]+)#?([^)]*)\) \|$", first, re.MULTILINE)
     words = {
         "../idm_env/tasks/": "", "jobs/files.md": "position_m", "../idm_env/effects/": "",
-        "architecture.md": "## Add a task", "jobs/train.md": "train_apg.py", "limits.md": "A GPU is for",
+        "architecture.md": "## Add a task", "jobs/train.md": "train_apg.py", "limits.md": "A GPU pays from",
         "cards.md": "## Cite",
     }  # fmt: skip
     assert [page for _, page, _ in rows] == list(words)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401
+from idm_env.envs.cuda_graph import Replayed
 from tests.laws.members import DTYPE, MEMBERS, N, around, inputs_for, label, start
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here: its tests have not run")
@@ -54,18 +55,41 @@ def test_every_effect_is_the_same_on_a_gpu():
 def test_environments_give_on_a_gpu_what_they_give_on_the_cpu(task):
     seen = {}
     for device in ("cpu", "cuda"):
-        seen[device] = driven(task, device)
+        seen[device] = driven(made(task, device), device)
     for mine, other in zip(seen["cpu"], seen["cuda"], strict=True):
         torch.testing.assert_close(other, mine, rtol=1e-9, atol=1e-9)
 
 
-def driven(task, device):
-    """Return the last observation and reward of ten steps, and the gradient by the action, on the CPU."""
+@pytest.mark.parametrize("task", ["ring", "merge"])
+def test_a_step_is_one_cuda_graph(task, recwarn):
+    """With and without gradients; the steps that torch does one by one give the same bits."""
+    seen = []
+    for replayed in (True, False):
+        env = made(task, "cuda")
+        assert isinstance(env.batch._step, Replayed)
+        if not replayed:
+            env.batch._step = env.batch._stepped
+        with torch.no_grad():
+            before = [env.step(torch.zeros(env.action_space.shape, device="cuda"))[0] for _ in range(3)]
+        seen.append([*before, *driven(env, "cuda")])
+        assert not replayed or len(env.batch._step._forms) >= 2  # None where it could not be recorded
+    for mine, other in zip(*seen, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-12, atol=1e-12)
+    assert not [w for w in recwarn if "CUDA graph" in str(w.message)]
+
+
+def made(task, device):
+    """Return eight environments."""
     short = {"warmup": 50} if task == "ring" else {}
     env = gymnasium.make_vec(
         "DiffIDM-v0", num_envs=8, task=task, output="torch", device=device, dtype="float64", **short
     )
     env.reset(seed=3)
+    return env.unwrapped
+
+
+def driven(env, device):
+    """Return the last observation and reward of ten steps, and the gradient by the action, on the CPU."""
     action = torch.full(env.action_space.shape, 0.3, dtype=torch.float64, device=device, requires_grad=True)
     total = torch.zeros((), dtype=torch.float64, device=device)
     for _ in range(10):

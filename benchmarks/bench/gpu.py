@@ -16,10 +16,10 @@ import torch
 import idm_env  # noqa: F401
 from benchmarks.bench import traffic
 
-STEPS = 20
+STEPS = 10
 FACES: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
-    "ring": ({"warmup": 50}, (64, 1024, 16_384)),
-    "merge": ({}, (64, 1024)),
+    "ring": ({"warmup": 0}, (64, 1024, 16_384, 131_072)),
+    "merge": ({}, (64, 1024, 8192)),
 }
 
 

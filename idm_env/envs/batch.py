@@ -24,6 +24,7 @@ from idm_env.compiled.kernels import dispatch
 from idm_env.compiled.scalar.record import Unordered, Untraceable
 from idm_env.envs.beginnings import Beginnings
 from idm_env.envs.counters import Counters
+from idm_env.envs.cuda_graph import Replayed
 from idm_env.envs.given import checked
 from idm_env.envs.moves import Moves
 from idm_env.envs.recording import Recorder
@@ -144,8 +145,10 @@ class Batch:
         self.episodes = np.full(count, -1, dtype=np.int64)
         self._world: EnvState | None = None
         self._moves = Moves(settings)
+        self._on_gpu = settings.device.type == "cuda"
         self.values: Values | None = self._compiled()
         """The worlds as compiled loops step them, None where torch does."""
+        self._step = Replayed(self._stepped) if self._on_gpu else self._stepped
         self._several = self.task.road.outline is not None
         self._entered = self.task.journeys > 0
         self._loaded = False
@@ -163,7 +166,7 @@ class Batch:
         self._block: dict[str, Tensor] | None = None
         self._drawn: dict[str, np.ndarray] = {}
         self.used = self._drawn_steps = 0
-        self._ahead = max(1, _NORMALS_AT_ONCE // (count * self.task.vehicles))
+        self._ahead = max(1, (_WINDOW if self._on_gpu else _NORMALS_AT_ONCE) // (count * self.task.vehicles))
 
     def _compiled(self) -> Values | None:
         """Return what steps in compiled loops, where that can be."""
@@ -426,11 +429,16 @@ class Batch:
         assert before is not None
         block = self._normals(lambda: before.state.step)
         normals = None if block is None else {name: x[self.used - 1] for name, x in block.items()}
+        step = self._stepped if self.task.simulator.untried else self._step
         driven = self.task.episode_params(before.episode, self.params)
-        self.world, outputs = self._moves.step(before, action, live, normals, driven, observed)
-        # What a task tells may be a part of its state: whoever is told gets numbers of his own.
-        outputs = {name: x.clone() for name, x in outputs.items()}
+        self.world, outputs = step(before, action, live, normals, driven, observed)
         return {n: x.cpu().numpy() for n, x in outputs.items()} if self.settings.output == "numpy" else outputs
+
+    def _stepped(self, *arguments: Any) -> tuple[EnvState, dict[str, Tensor]]:
+        """Return worlds Δt later and what is told of them (``Moves.step``)."""
+        world, outputs = self._moves.step(*arguments)
+        # What a task tells may be a part of its state: whoever is told gets numbers of his own.
+        return world, {name: x.clone() for name, x in outputs.items()}
 
     def _step_values(
         self, action: Any, live: Tensor | None, observed: bool, steps: int
