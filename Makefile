@@ -27,7 +27,8 @@ demo: $(VENV)/.data
 # Most tests, of compiled code above all, run it as users do. Those that make many environments and step each of them a little
 # compile it unoptimised, which takes half the time. Each file on one worker, which compiles its programs once.
 FACES := $(addprefix tests/envs/test_,gym.py pettingzoo.py sb3.py render.py limits.py fitting_wrapper.py)
-LITTLE := tests/agents tests/tasks tests/envs/test_recording.py $(FACES) \
+LITTLE := tests/agents tests/tasks $(addprefix tests/envs/test_,recording.py unroll.py step_gradients.py) $(FACES) \
+  tests/laws/test_printed.py tests/kernels/test_policy_rows.py \
   $(filter-out tests/test_docs.py tests/test_faults.py,$(wildcard tests/test_*.py))
 TEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST)
 test: test-much test-little
