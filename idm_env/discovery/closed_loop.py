@@ -52,8 +52,7 @@ class ClosedLoopFit:
         pull = self.problem.per_group(np.einsum("rmi,rmq->riq", self.linear.by_theta * part, response))
         follow = np.einsum("gij,gjq->giq", self.absorb, pull / self.problem.sigma**2)
         moved = response - np.einsum("rmi,riq->rmq", self.linear.by_theta, follow[rows.group])
-        result: np.ndarray = moved * self.scored[..., None]
-        return result
+        return moved * self.scored[..., None]
 
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Return the weighted sums over units of values [R, ...]."""
@@ -63,8 +62,7 @@ class ClosedLoopFit:
     @property
     def errors(self) -> np.ndarray:
         """Errors of the gap (m) on the scored time [R, m]."""
-        result: np.ndarray = self.linear.residual * self.scored
-        return result
+        return self.linear.residual * self.scored
 
 
 def evaluate(

@@ -60,8 +60,7 @@ class Discovery:
     @cached_property
     def report(self) -> dict[str, Any]:
         """The content of ``report.json``."""
-        content: dict[str, Any] = storage.plain(self.result)
-        return content
+        return storage.plain(self.result)
 
     @property
     def found_effect(self) -> str:
@@ -122,8 +121,8 @@ def finished(
             noisy, agreements = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
             errors = replica.ahead(everywhere[0], everywhere[1].theta, noisy.model)
             worst, unsteady = tails.worst(everywhere[0].rows, errors), (float(np.median(noisy.sigma)), noisy.memory_s)
-            ladder = replace(ladder, agreement=agreements["scene"], tails=agreements["tails"], worst=worst)
-            ladder = replace(ladder, sizes=agreements["sizes"], past=agreements["past"], unsteady=unsteady)
+            ladder = replace(ladder, worst=worst, unsteady=unsteady, agreement=agreements["scene"])
+            ladder = replace(ladder, tails=agreements["tails"], sizes=agreements["sizes"], past=agreements["past"])
             ladder = replace(ladder, leading=agreements.get("leading"))
         judgement = replace(judgement, ladder=ladder)
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]

@@ -126,9 +126,7 @@ def unweighed(
         for x in ([] if calibrated else [centre]) + ([] if start is None else [start])
     ]
     costs = [_costs(problem, fit) for fit in fits]
-    theta, cost = fits[0].theta, costs[0]
-    if len(fits) > 1:
-        theta, cost = _better(theta, cost, fits[1].theta, costs[1])
+    theta, cost = _better(fits[0].theta, costs[0], fits[-1].theta, costs[-1])
     samples = problem.per_group(rows.valid.sum(1))
     each = cost / np.maximum(samples, 1)
     stuck = (each > STUCK**2 * np.median(each[samples > 0])) & (samples > 0)
@@ -142,8 +140,7 @@ def unweighed(
 
 def _costs(problem: Problem, s: Solution) -> np.ndarray:
     """Return the cost of every group [G]."""
-    costs: np.ndarray = cost_of(problem, s.theta[None], s.linear.residual[None])[0]
-    return costs
+    return cost_of(problem, s.theta[None], s.linear.residual[None])[0]
 
 
 def _better(
@@ -233,10 +230,8 @@ def floor(records: Records) -> dict[str, float]:
 
     Over a horizon that is the noise of its end; the noise of its start fades, because drivers correct it.
     """
-    gaps, speeds = [], []
-    for e in records.episodes:
-        gaps.append(noise_sigma(e.gap_m))
-        speeds.append(noise_sigma(e.speed_mps))
+    gaps = [noise_sigma(e.gap_m) for e in records.episodes]
+    speeds = [noise_sigma(e.speed_mps) for e in records.episodes]
     gap = float(np.sqrt(np.mean(np.square(gaps))))
     return {
         "gap_rmse_m": gap,

@@ -39,12 +39,8 @@ def write(path: Path, d: Discovery) -> None:
     rules = {"enough_runs": ENOUGH_RUNS, "many_runs": MANY_RUNS, "free_share": f"{CLOSED_LOOP_SHARE:.0%}"}
     rules |= {"level": percent(ALPHA), "least_gain": percent(LEAST_GAIN, 1), "least_share": percent(LEAST_SHARE)}
     names: dict[str, Any] = {"r": r, "d": d, "law": law, "rules": rules | {"holds": f"{HOLDS - 1.0:.0%}"}}
-    names |= {
-        "titles": judgement.titles,
-        "cards": cards(r, law) + words.rolled(r.rolled),
-        "draw": pictures,
-        "picture": pages.picture,
-    }
+    names |= {"titles": judgement.titles, "cards": cards(r, law) + words.rolled(r.rolled)}
+    names |= {"draw": pictures, "picture": pages.picture}
     names |= {"error_names": words.ERRORS, "most": words.MANY, "shortened": pages.shortened}
     names |= {"rows": words.error_rows(d.report, list(judgement.results)), "weight": words.weight(r.prior)}
     names["declared"] = {p.name: p for p in d.null.model.catalogue.own}

@@ -54,8 +54,7 @@ def _projected(scored: Scored) -> np.ndarray | None:
         return None
     mine = solution.model.where(scored.term.label)
     weight = solution.values[mine] if scored.term.size > 4 else np.eye(scored.term.size)[0]
-    response: np.ndarray = projected(solution)[..., mine] @ weight
-    return response
+    return projected(solution)[..., mine] @ weight
 
 
 def look_alikes(d: Discovery) -> Figure | None:

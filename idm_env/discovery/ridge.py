@@ -72,8 +72,7 @@ class Ridge:
 
     def at(self, columns: np.ndarray) -> np.ndarray:
         """Return what each part's absence predicts [P, folds] at ``columns`` [P, columns], or at means of such."""
-        result: np.ndarray = self.coefficients[0] + (columns - self.middle) / self.scale @ self.coefficients[1:]
-        return result
+        return self.coefficients[0] + (columns - self.middle) / self.scale @ self.coefficients[1:]
 
 
 def _ridges(basis: np.ndarray, error: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -81,8 +80,7 @@ def _ridges(basis: np.ndarray, error: np.ndarray, weight: np.ndarray) -> np.ndar
     value, vector = np.linalg.eigh((basis * weight[:, None]).T @ basis)
     push = vector.T @ (basis.T @ (weight * error))
     scale = value[:, None] + np.array(RIDGES) * weight.sum() + 1e-12  # of no windows nothing is predicted
-    result: np.ndarray = vector @ (push[:, None] / scale)
-    return result
+    return vector @ (push[:, None] / scale)
 
 
 def units(rows: Rows) -> np.ndarray:
@@ -94,12 +92,10 @@ def weights(rows: Rows, error: np.ndarray) -> np.ndarray:
     """Return what a window counts [W]: one over its driver's mean square plus the usual one."""
     square = by_group(rows, error**2)
     usual = max(float(np.median(square)), 1e-9)
-    weight: np.ndarray = usual / (square + usual)
-    return weight
+    return usual / (square + usual)
 
 
 def by_group(rows: Rows, values: np.ndarray) -> np.ndarray:
     """Return values [W] as the mean over the driver's windows of every window [W]."""
     count = np.bincount(rows.group)
-    result: np.ndarray = (np.bincount(rows.group, values) / np.maximum(count, 1))[rows.group]
-    return result
+    return (np.bincount(rows.group, values) / np.maximum(count, 1))[rows.group]

@@ -102,8 +102,7 @@ def without_own_run(problem: Problem, solution: Solution) -> np.ndarray:
 def log_gain(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Return the gains in log RMSE [units] from squares before and after; 0 where a unit has nothing to tell."""
     seen = (before > 0.0) & (after > 0.0)
-    gains: np.ndarray = 0.5 * np.log(np.where(seen, before, 1.0) / np.where(seen, after, 1.0))
-    return gains
+    return 0.5 * np.log(np.where(seen, before, 1.0) / np.where(seen, after, 1.0))
 
 
 @dataclass(frozen=True)
@@ -154,8 +153,7 @@ def _flipped(gains: np.ndarray, seed: int, run: np.ndarray) -> np.ndarray:
     """Return the statistic of candidates with signs flipped [flips, K], first as it is."""
     roots = np.sign(gains) * np.sqrt(np.abs(gains))
     flips = signs(run, rho(roots, run), seed)
-    statistic: np.ndarray = flips @ roots.T / np.sqrt(np.abs(gains).sum(1) + FAINT * gains.shape[1])
-    return statistic
+    return flips @ roots.T / np.sqrt(np.abs(gains).sum(1) + FAINT * gains.shape[1])
 
 
 def interval_of(solution: Solution, problem: Problem) -> np.ndarray:
@@ -189,8 +187,7 @@ def half_width(solution: Solution, problem: Problem) -> np.ndarray:
     null = np.array([p.null or 0.0 if p.role == "strength" else 0.0 for p in solution.model.parameters])
     own = np.array([p.role != "place" for p in solution.model.parameters])
     share = SYSTEMATIC + min(NOISY * (0.0 if problem.noise is None else problem.noise.wander), MOST_NOISY)
-    result: np.ndarray = np.sqrt(width**2 + (1.96 * share * own * (solution.values - null)) ** 2)
-    return result
+    return np.sqrt(width**2 + (1.96 * share * own * (solution.values - null)) ** 2)
 
 
 def _variances(solution: Solution, problem: Problem) -> tuple[np.ndarray, np.ndarray, float]:

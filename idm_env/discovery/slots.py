@@ -99,8 +99,7 @@ class _OverAny(OverFeature):
 def _value(effect: Slot | Push, scene: Scene, driver: Driver, p: P) -> Tensor:
     """Return c."""
     if effect.given:
-        value: Tensor = scene.input(effect.name)
-        return value
+        return scene.input(effect.name)
     if effect.past:
         x = torch.where(p["over"] == list(FEATURES).index(AGO), change_of(scene), scene.memory[effect.name])
     else:

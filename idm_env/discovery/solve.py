@@ -193,8 +193,10 @@ def differences(parameters: tuple[Parameter, ...], values: np.ndarray) -> np.nda
     return size
 
 
-def linearise(problem: Problem, model: Hypothesis, theta: np.ndarray, values: np.ndarray) -> Linear:
-    """Return the residual at log θ [G, P] and φ [Q], and its derivatives by forward differences."""
+def linearise(
+    problem: Problem, model: Hypothesis, theta: np.ndarray, values: np.ndarray, base: np.ndarray | None = None
+) -> Linear:
+    """Return the residual at log θ [G, P] and φ [Q], ``base`` [R, m] or not, and its forward differences."""
     count, own = model.entries.size, theta.shape[-1]
     step = np.append(np.full(own, STEP), differences(model.parameters, values))
     many = np.repeat(theta[None], 1 + own + count, axis=0)
@@ -203,8 +205,10 @@ def linearise(problem: Problem, model: Hypothesis, theta: np.ndarray, values: np
         many[1 + i, :, i] += STEP
     for i in range(count):
         shared[1 + own + i, i] += step[own + i]
-    residual = problem.residual(problem.errors(many, model, shared))
-    return Linear(residual[0], (residual[1:] - residual[0]) / step[:, None, None], own)
+    first = int(base is not None)
+    residual = problem.residual(problem.errors(many[first:], model, shared[first:]))
+    here, moved = (residual[0], residual[1:]) if base is None else (base, residual)
+    return Linear(here, (moved - here) / step[:, None, None], own)
 
 
 def prior_of(model: Hypothesis) -> np.ndarray:
@@ -238,9 +242,7 @@ def _sums(problem: Problem, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
 
 def cost_of(problem: Problem, theta: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Return the cost of every copy and group [C, G]: squared residuals and the prior."""
-    return np.asarray(
-        problem.per_group(_squares(residual).T).T + problem.prior.equations(torch.from_numpy(theta))[0].numpy()
-    )
+    return problem.per_group(_squares(residual).T).T + problem.prior.equations(torch.from_numpy(theta))[0].numpy()
 
 
 def _squares(residual: np.ndarray) -> np.ndarray:
@@ -260,11 +262,28 @@ class _Nested:
         of_theta = np.column_stack((bounds, np.full(len(bounds), LONGEST)))
         self.boxes = Box(*torch.from_numpy(of_theta.T)), Box(*torch.from_numpy(of_phi.T))
         self.at: tuple[Tensor, Tensor, Linear] | None = None
+        self.tried: list[tuple[Tensor, Tensor, np.ndarray]] = []
+        self.parts: dict[bytes, Problem] = {}
 
     def costs(self, own: Tensor, shared: Tensor) -> Tensor:
-        """Return the sums of squared residuals [C, G]."""
-        residual = self.problem.residual(self.problem.errors(own.numpy(), self.model, shared.numpy()))
+        """Return the sums of squared residuals [C, G]; of one copy only groups that have moved are rolled out."""
+        part, moved = self._moved(own, shared)
+        residual = part.residual(part.errors(own.numpy(), self.model, shared.numpy()))
+        if self.at is not None and not moved.all():
+            part_of_it, residual = residual[0], self.at[2].residual[None].copy()
+            residual[0, moved] = part_of_it
+        self.tried = list(zip(own, shared, residual, strict=True))
         return torch.from_numpy(self.problem.per_group(_squares(residual).T)).T
+
+    def _moved(self, own: Tensor, shared: Tensor) -> tuple[Problem, np.ndarray]:
+        """Return the problem of groups that are not where they were linearised, and which rows [R] it has."""
+        moved = np.ones(len(self.problem.rows), bool)
+        if self.at is not None and len(own) == 1 and torch.equal(self.at[1], shared):
+            moved = (own[0] != self.at[0][0]).any(-1).numpy()[self.problem.rows.group]
+        key = moved.tobytes()
+        if key not in self.parts:
+            self.parts[key] = self.problem if moved.all() else self.problem.of_rows(moved)
+        return self.parts[key], moved
 
     def normal(self, own: Tensor, shared: Tensor) -> Normal:
         """Return the normal equations of one copy."""
@@ -275,16 +294,17 @@ class _Nested:
 
     def linear(self, own: Tensor, shared: Tensor) -> Linear:
         """Return the linearisation of one copy; of groups at which nothing has changed the last one is kept."""
-        theta, values = own[0].numpy(), shared[0].numpy()
-        if self.at is None or not torch.equal(self.at[1], shared):
-            self.at = own, shared, linearise(self.problem, self.model, theta, values)
-        moved = (theta != self.at[0][0].numpy()).any(-1)[self.problem.rows.group]
-        if moved.any():
-            part = linearise(self.problem.of_rows(moved), self.model, theta, values)
+        part, moved = self._moved(own, shared)
+        # What was tried there has its residual already.
+        group, values = part.rows.group, shared[0]
+        trials = [r[moved] for x, v, r in self.tried if torch.equal(v, values) and torch.equal(x[group], own[0][group])]
+        new = linearise(part, self.model, own[0].numpy(), values.numpy(), trials[0] if trials else None)
+        if self.at is not None and not moved.all():
             residual, jacobian = self.at[2].residual.copy(), self.at[2].jacobian.copy()
-            residual[moved], jacobian[:, moved] = part.residual, part.jacobian
-            self.at = own, shared, Linear(residual, jacobian, part.own)
-        return self.at[2]
+            residual[moved], jacobian[:, moved] = new.residual, new.jacobian
+            new = Linear(residual, jacobian, new.own)
+        self.at = own, shared, new
+        return new
 
 
 def _longest(p: Parameter) -> float:

@@ -346,12 +346,10 @@ def standard_errors(solution: Solution) -> np.ndarray:
     # The groups of a calibration are those of its normal equations; rows are summed by group there already.
     groups = len(solution.theta)
     matrix = np.tile(np.diag(solution.prior.width**-2.0), (groups, 1, 1))
-    count = np.zeros(groups)
-    square = np.zeros(groups)
     group = solution.row_group
     np.add.at(matrix, group, np.einsum("rmi,rmj->rij", linear.by_theta, linear.by_theta) / 10.0)
-    np.add.at(square, group, (linear.residual**2).sum(1))
-    np.add.at(count, group, (linear.by_theta != 0).any(-1).sum(1))
+    square = np.bincount(group, (linear.residual**2).sum(1), groups)
+    count = np.bincount(group, (linear.by_theta != 0).any(-1).sum(1), groups)
     variance = np.maximum(square / np.maximum(count, 1), 1e-9)
     inverse = np.linalg.inv(matrix / variance[:, None, None] + 1e-9 * np.eye(matrix.shape[-1]))
     return np.sqrt(np.einsum("gii->gi", inverse))
@@ -363,11 +361,8 @@ def _data(
     prepared, rows = evaluation.records, evaluation.searching.problem.rows
     inside = np.concatenate([np.arange(a, b) for a, b in zip(prepared.first, prepared.bounds[1:], strict=True)])
     speed, gap = prepared.speed[inside], prepared.gap[inside]
-    closing, free, standing = (
-        speed - prepared.column("lead_speed")[inside],
-        gap > 3.0 * np.maximum(speed, 2.0),
-        speed < 0.3,
-    )
+    closing, free = speed - prepared.column("lead_speed")[inside], gap > 3.0 * np.maximum(speed, 2.0)
+    standing = speed < 0.3
     residual = null.linear.residual
     return result.DataCard(
         **trajectories.summary(),  # type: ignore[arg-type]

@@ -36,8 +36,7 @@ class Units:
         """Return, for every unit, the sum of values [units, ...] over the units of all other runs."""
         total = np.zeros((int(self.run.max(initial=-1)) + 1, *values.shape[1:]))
         np.add.at(total, self.run, values)
-        result: np.ndarray = total.sum(0) - total[self.run]
-        return result
+        return total.sum(0) - total[self.run]
 
     def sums(self, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the sums over units of values [R, ...], row i of record ``rows[i]``."""

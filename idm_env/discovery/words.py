@@ -440,12 +440,8 @@ def error_rows(report: Mapping[str, Any], titles: Sequence[str]) -> list[dict[st
         if titles[1:]:
             outcome = helps.get(key, {"verdict": "–", "interval": "–"})
             change = percent(after[key] / before[key]) if before[key] else "–"
-            row |= {
-                titles[1]: after[key],
-                "change": change,
-                "95 % interval": outcome["interval"],
-                "verdict": outcome["verdict"],
-            }
+            row |= {titles[1]: after[key], "change": change}
+            row |= {"95 % interval": outcome["interval"], "verdict": outcome["verdict"]}
         rows.append(row)
     return rows
 

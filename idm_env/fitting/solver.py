@@ -190,8 +190,14 @@ def _apart(
     own, now = progress.own, _add_prior(prior, data, progress.own)
     trial = _own_tried(now, progress, problem.boxes[0])
     trial = torch.where(progress.done[..., None], own, trial)
-    fresh = problem.normal(trial, progress.shared)
-    cost = _add_prior(prior, fresh, trial).cost
+    # Where a cost alone is cheap, equations are made of accepted trials only.
+    fresh = None
+    if problem.costs is None:
+        fresh = problem.normal(trial, progress.shared)
+        data_cost = fresh.cost
+    else:
+        data_cost = problem.costs(trial, progress.shared)
+    cost = data_cost if prior is None else data_cost + prior.equations(trial)[0]
     better = (cost < now.cost) & ~progress.done
     small = now.cost - cost <= tolerance * now.cost
     promised = -(now.gradient[..., : own.shape[-1]] * (trial - own)).sum(-1)
@@ -199,12 +205,13 @@ def _apart(
     hopeless = ~better & (promised >= 0.0) & (promised <= tolerance * now.cost)
     damping = _redamped(progress.damping, better)
     done = progress.done | (better & small) | hopeless | (damping > 1e8)
+    own, count = torch.where(better[..., None], trial, own), progress.iteration + 1
+    fresh = fresh or problem.normal(own, progress.shared)
     data = Normal(
         torch.where(better, fresh.cost, data.cost),
         torch.where(better[..., None], fresh.gradient, data.gradient),
         torch.where(better[..., None, None], fresh.hessian, data.hessian),
     )
-    own, count = torch.where(better[..., None], trial, own), progress.iteration + 1
     return replace(progress, own=own, damping=damping, done=done, iteration=count, finished=bool(done.all())), data
 
 
