@@ -52,8 +52,9 @@ class Tangents:
 class DriverProgram:
     """The step of one driver; ``fixed`` are slots that have one value always.
 
-    ``after`` are his states after a step by name, ``signals`` what the past keeps of him (by its number), ``hoist``
-    what depends on parameters alone, ``agos`` how many steps ago somebody looks, ``seen`` the past as (signal, ago).
+    ``states`` are names, gap and speed first; ``after`` has the states after a step. ``sense`` has what the past
+    keeps, by the numbers ``signals``. ``whole`` and ``whole_sense`` are the same with nothing hoisted, and ``hoist``
+    depends on parameters alone. ``agos`` are how many steps ago somebody looks, ``seen`` the past as (signal, ago).
     ``Untraceable`` for an effect that looks back by a time that changes under way.
     """
 
@@ -68,17 +69,18 @@ class DriverProgram:
         self._accel, sense = nodes[0], nodes[1 + len(names) :]
         self._respond = dict(zip(names, nodes[1:], strict=False))
         after = self._closure(sense)
-        (*self._after, self._accel), looks, self.agos = recalled(graph, [*after.values(), self._accel], "past {number}")
+        (*whole, self._accel), looks, self.agos = recalled(graph, [*after.values(), self._accel], "past {number}")
         if changing := next((steps for steps in self.agos if steps.level == DYNAMIC), None):
             raise Untraceable(f"effect '{changing.note}' looks back by a time that changes under way")
         self.seen = [(look.signal, look.ago) for look in looks]
         used = sorted({signal for signal, _ in self.seen})
-        self._names = list(after)
-        self._sense = [sense[i] for i in used]
+        self.states = tuple(after)
+        self.whole = dict(zip(after, whole, strict=True))
+        self.whole_sense = [sense[i] for i in used]
         self.signals = tuple(used)
-        cut, self.hoist = hoisted(graph, [*self._after, *self._sense])
-        self.after = dict(zip(self._names, cut, strict=False))
-        self.sense = dict(zip(used, cut[len(self._names) :], strict=False))
+        cut, self.hoist = hoisted(graph, [*whole, *self.whole_sense])
+        self.after = dict(zip(after, cut, strict=False))
+        self.sense = dict(zip(used, cut[len(after) :], strict=False))
 
     # -- what a step is ------------------------------------------------------------------------------------------
 
@@ -133,11 +135,6 @@ class DriverProgram:
     # -- what there is -------------------------------------------------------------------------------------------
 
     @cached_property
-    def states(self) -> tuple[str, ...]:
-        """States, gap and speed first."""
-        return tuple(self._names)
-
-    @cached_property
     def moving(self) -> tuple[str, ...]:
         """States that have derivatives: all but the clock and gaps between records."""
         return tuple(n for n in self.states if n != "step" and not n.endswith(" ahead"))
@@ -145,7 +142,7 @@ class DriverProgram:
     @cached_property
     def slots(self) -> list[Leaf]:
         """Everything that is read."""
-        return inputs_of([*self._after, *self._sense, *self.agos])
+        return inputs_of([*self.whole.values(), *self.whole_sense, *self.agos])
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
@@ -206,14 +203,9 @@ class DriverProgram:
     @property
     def narrow(self) -> list[Node]:
         """The few numbers that most of a step flows through, each after those that it needs."""
-        memories = [x for n, x in zip(self._names, self._after, strict=True) if n.startswith("memory of ")]
+        memories = [x for n, x in self.whole.items() if n.startswith("memory of ")]
         places = {x for x in (self._accel, *memories) if x.args and x.level == DYNAMIC}
-        return [x for x in ordered([*self._after, self._accel]) if x in places]
-
-    @property
-    def whole(self) -> tuple[list[Node], list[Node]]:
-        """States after a step and signals, with nothing taken out."""
-        return self._after, self._sense
+        return [x for x in ordered([*self.whole.values(), self._accel]) if x in places]
 
 
 class _Carrying:
@@ -222,18 +214,17 @@ class _Carrying:
     def __init__(self, program: DriverProgram, names: tuple[str, ...]) -> None:
         self.program, self.names, self.result = program, names, Tangents()
         self.graph = program.graph
-        after, sense = program.whole
         narrow = program.narrow
         self._inside = {self.graph.input(f"narrow {i}"): x for i, x in enumerate(narrow)}
         self._tangents: dict[str, Node | None] = {}
         self._rows: dict[Node, Node] = {}
-        for signal, node in zip(program.signals, sense, strict=True):
+        for signal, node in zip(program.signals, program.whole_sense, strict=True):
             along = self._along(node)
             if along is not None:
                 self.result.sense[signal] = along
         for i, node in enumerate(narrow):
             self._tangents[f"narrow {i}"] = self._along(node)
-        carry = {n: self._along(x) for n, x in zip(program.states, after, strict=True) if n in program.moving}
+        carry = {n: self._along(x) for n, x in program.whole.items() if n in program.moving}
         self.result.carry = {n: x or self.graph.constant(0.0) for n, x in carry.items()}
         self._hoist()
 
