@@ -81,20 +81,13 @@ def parameter_rows(
     """
     result, _ = fit_drivers(filtered, before, model)
     values: dict[str, dict[str, Any]] = {}
-    if result is not None:
-        for g, group in enumerate(result.problem.groups):
-            row: dict[str, Any] = {"source": "leader"}
-            for i, p in enumerate(IDM.declared):
-                row[p.name] = float(result.own[g, i])
-                row[f"{p.name}_error"] = float(result.uncertainty.standard_error[g, i])
-                row[f"{p.name}_identified"] = bool(result.uncertainty.identified[g, i])
-            values[group] = row
-    empty: dict[str, Any] = {"source": "none"}
-    for p in IDM.declared:
-        empty |= {p.name: None, f"{p.name}_error": None, f"{p.name}_identified": False}
+    for row in result.table() if result is not None else ():
+        name = row["parameter"].rpartition(".")[2]
+        own = values.setdefault(row["group"], {"source": "leader"})
+        own |= {name: row["estimate"], f"{name}_error": row["standard_error"], f"{name}_identified": row["identified"]}
+    empty = {"source": "none", **{f"{p.name}_identified": False for p in IDM.declared}}
     rows = []
     for f in filtered:
-        key = f"{f.track.run_id}/{f.track.vehicle_id}"
         names = {"run_id": f.track.run_id, "vehicle_id": f.track.vehicle_id, "piece": f.track.piece}
-        rows.append(names | values.get(key, empty))
+        rows.append(names | values.get(f"{f.track.run_id}/{f.track.vehicle_id}", empty))
     return rows
