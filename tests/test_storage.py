@@ -322,7 +322,7 @@ def test_every_broken_file_of_a_store_is_one_line(tmp_path: Path) -> None:
     store.put("tensors", {"x": torch.zeros(5)})
     store.put_json("plain", {"x": [1, 2, 3]})
     for key, get in (("tensors", store.get), ("plain", store.get_json)):
-        path = store.path(f"{key}.kept")
+        path = tmp_path / "fit" / f"{key}.kept"
         for name, broken in damaged(path).items():
             path.write_bytes(broken)
             with pytest.raises(ValueError, match=rf"{key}\.kept is broken .* Leave out --resume") as told:

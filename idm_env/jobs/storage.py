@@ -352,11 +352,6 @@ class Store:
         folder.mkdir(parents=True, exist_ok=True)
         _sign(folder, fingerprint=run)
 
-    def path(self, name: str) -> Path:
-        """Return the path of a file of this run."""
-        assert self.folder is not None, "a store in memory has no files"
-        return self.folder / name
-
     def put(self, key: str, content: Any) -> None:
         """Keep tensors and plain values, nested in mappings and lists."""
         import torch
