@@ -271,7 +271,7 @@ def top_level() -> set[str]:
         (ways_up, 0),
         (classes_named_twice, 7),
         (lines_behind_a_step, 2292),
-        (lines_of_code, 35274),
+        (lines_of_code, 35260),
         (functions_of_many_parameters, 15),
         (high_packages, 1),
         (file_names_twice, 25),
