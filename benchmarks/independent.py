@@ -63,6 +63,7 @@ FIVE = (0, 1, 2, 3, 4)
 GAINS = ((7, 0.1), (8, 0.3))
 LAWS = {
     "IDM": Law(IDM, FIVE),
+    "IDM, stiffness 0.21 for all": Law(IDM, FIVE, ((7, 0.21),)),
     "IDM, own stiffness": Law(IDM, (*FIVE, 7)),
     "IDM, own trend, stiffness, closing gain": Law(IDM, (*FIVE, 5, 6, 7, 8)),
     "improved IDM": Law(IIDM, FIVE),
