@@ -270,7 +270,7 @@ def top_level() -> set[str]:
         (circles, 0),
         (ways_up, 0),
         (classes_named_twice, 7),
-        (lines_behind_a_step, 2292),
+        (lines_behind_a_step, 2281),
         (lines_of_code, 35260),
         (functions_of_many_parameters, 15),
         (high_packages, 1),

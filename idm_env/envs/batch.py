@@ -10,6 +10,7 @@ Shapes: rows are environments: states ``[rows, n]``, actions ``[rows, agents, â€
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -44,7 +45,8 @@ _POOL_STREAM = 2
 _NORMALS_AT_ONCE = 1 << 14
 _WINDOW = 1 << 20
 """Most normals that are drawn ahead of steps one by one, and of a window."""
-_MARKED = ("_world", "_loaded", "_seen", "_draw", "_driven", "_block", "_drawn", "_drawn_steps", "used", "_pool")
+_MARKED = ["_world", "_loaded", "_seen", "_there", "_draw", "_driven"]
+_MARKED += ["_block", "_drawn", "_drawn_steps", "used", "_pool"]
 
 
 class Whole(NamedTuple):
@@ -61,7 +63,7 @@ class Whole(NamedTuple):
 class Outcome(NamedTuple):
     """What a step gives: observations ``(n, agents, features)``, the others ``(n, agents)``, by name in ``details``.
 
-    Tensors, or arrays with numpy output.
+    Tensors, or arrays with numpy output, which hold until the next step.
     """
 
     observation: Any
@@ -106,7 +108,9 @@ def _held(before: Outcome, after: Outcome, over: Any) -> Outcome:
 def _summed(rows: Mapping[str, np.ndarray], steps: int) -> dict[str, np.ndarray]:
     """Return outputs of steps under one action, from those of each of them ``[steps, rows, â€¦]``, as ``_held``."""
     paid = {n: rows[n][:steps] for n in ("reward", "whole_reward", "info_rewards") if n in rows}
-    return {n: x[steps - 1].copy() for n, x in rows.items()} | {n: sum(x[1:], x[0].copy()) for n, x in paid.items()}
+    # One after the other: a sum goes in pairs.
+    sums = {n: np.add.accumulate(x, dtype=x.dtype)[-1] for n, x in paid.items()}
+    return {n: x[steps - 1] for n, x in rows.items()} | sums
 
 
 @functools.lru_cache(32)
@@ -153,6 +157,7 @@ class Batch:
         self._entered = self.task.journeys > 0
         self._loaded = False
         self._seen: Any = None
+        self._there: Any = None
         self._reasons: dict[int, str] = {}
         self.counters: Counters | None = None
         self.recording: Recorder | None = None
@@ -191,7 +196,7 @@ class Batch:
 
     @world.setter
     def world(self, world: EnvState | None) -> None:
-        self._world, self._loaded = world, False
+        self._world, self._loaded, self._there = world, False, None
 
     def glance(self) -> EnvState:
         """Return the worlds as they are now, for reading only and until the next step."""
@@ -234,6 +239,7 @@ class Batch:
 
     def _took(self, index: np.ndarray, fresh: EnvState, draw: Draw, every: bool) -> Tensor | np.ndarray:
         """Put new worlds into some rows, or all; return the observations of all of them."""
+        self._there = None
         if every or not self.begun or self._draw is None:
             self.world, self._draw = fresh, draw
         elif self.values is not None and self._loaded and self._seen is not None:
@@ -246,7 +252,7 @@ class Batch:
                 self._seen = self._seen.index_copy(0, torch.as_tensor(index), seen)
                 return self._seen.clone()
             self._seen[index] = seen.detach().numpy()
-            return self._seen.copy()  # type: ignore[no-any-return]
+            return self._seen  # type: ignore[no-any-return]
         else:
             where = torch.as_tensor(index, device=self.settings.device)
             self.world = mapped(lambda old, new: old.index_put((where,), new), self.world, fresh)
@@ -320,7 +326,10 @@ class Batch:
         assert values is not None
         if not self.task.simulator.draws:
             return 64, None
-        self._fill(values.clock, max(self._ahead, min(64, _WINDOW // (self.count * self.task.vehicles)) or 1))
+        self._fill(
+            lambda: torch.from_numpy(values.now.clock),
+            max(self._ahead, min(64, _WINDOW // (self.count * self.task.vehicles)) or 1),
+        )
         return self._drawn_steps - self.used, self._drawn
 
     def episode_params(self) -> Params:
@@ -339,9 +348,12 @@ class Batch:
     def saw(self, seen: Tensor) -> None:
         """Note what is observed now, after steps that were done elsewhere."""
         self._world, self._loaded, self._seen = None, True, seen.view(self.count, len(self.task.agents), -1)
+        self._there = None
 
     def on_road(self) -> Tensor:
         """Return which agents' vehicles are on the road ``(n, agents)``."""
+        if self._there is not None:
+            return torch.as_tensor(self._there)
         every = torch.ones(self.count, len(self.task.agents), dtype=torch.bool, device=self.settings.device)
         return self.task.there(self.glance().state, every)
 
@@ -385,11 +397,12 @@ class Batch:
             over = outcome.whole.terminated | outcome.whole.truncated
             if not _some(~over):
                 break
-            outcome = _held(outcome, self._once(action, live, not left or _some(over))[0], over)
+            before = outcome if self.settings.output == "torch" else copy.deepcopy(outcome)
+            outcome = _held(before, self._once(action, live, not left or _some(over))[0], over)
         if self.counters is None or "stops" not in self.settings.info:
             return outcome
         self.counters.decided(self.glance().state)
-        stops: Any = self.counters.stops.unsqueeze(-1).repeat(1, len(self.task.agents))
+        stops: Any = torch.as_tensor(self.counters.stops[:, None][:, [0] * len(self.task.agents)])
         stops = stops if self.settings.output == "torch" else stops.cpu().numpy()
         return outcome._replace(details={**outcome.details, "stops": stops})
 
@@ -463,7 +476,7 @@ class Batch:
                 outputs, steps = _summed(*rows), rows[1]
                 self.used += steps
             else:
-                noise = None if self._normals(values.clock) is None else self._drawn
+                noise = None if self._normals(lambda: torch.from_numpy(values.now.clock)) is None else self._drawn
                 outputs = values.step(action, who, noise, max(self.used - 1, 0), self.episode_params(), observed)
         except Untraceable as why:
             self._world, self._loaded = self.world, False
@@ -474,9 +487,9 @@ class Batch:
                     warnings.warn(f"no compiled step, the torch path runs instead: {why}.", stacklevel=4)
                 self.values = None
             return None
-        # What is told is written to by whom it pleases.
-        seen = outputs["observation"]
-        self._world, self._loaded, self._seen = None, True, seen.clone() if isinstance(seen, Tensor) else seen.copy()
+        # What is told as a tensor is written to by whom it pleases.
+        seen, self._there = outputs["observation"], outputs.get("on_road")
+        self._world, self._loaded, self._seen = None, True, seen.clone() if isinstance(seen, Tensor) else seen
         return outputs, steps
 
     def detach(self) -> None:

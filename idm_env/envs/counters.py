@@ -19,19 +19,24 @@ from idm_env.tasks.said_roads import STANDS
 from idm_env.types import State
 
 
-class _Seen(NamedTuple):
-    """Vehicles ``(rows, n)`` as they were, on their device; ``trip`` tells the journeys of a slot apart."""
+def _numbers(x: Tensor) -> Any:
+    """Return numbers where they lie: of few of them an array knows sooner."""
+    return x.detach().numpy() if x.is_cpu else x.detach()
 
-    speed: Tensor
-    present: Tensor
-    trip: Tensor
+
+class _Seen(NamedTuple):
+    """Vehicles ``(rows, n)`` as they were, arrays or tensors; ``trip`` tells the journeys of a slot apart."""
+
+    stands: Any
+    present: Any
+    trip: Any
 
     @classmethod
     def of(cls, state: State) -> _Seen:
         assert state.present is not None and state.lanes is not None and state.lanes.trips is not None
-        return cls(state.speed.detach().clone(), state.present > 0, state.lanes.trips.left.clone())
+        return cls(_numbers(state.speed) < STANDS, _numbers(state.present) > 0, _numbers(state.lanes.trips.left) + 0)
 
-    def same(self, later: _Seen) -> Tensor:
+    def same(self, later: _Seen) -> Any:
         """Return which vehicles are there on the same trip later."""
         return self.present & later.present & (self.trip == later.trip)
 
@@ -41,7 +46,7 @@ class Counters:
 
     def __init__(self, task: OpenLanesTask, rows: int, device: torch.device) -> None:
         self.loops, self._dt = task.loops, task.simulator.dt
-        self.stops = torch.zeros(rows, dtype=torch.int64, device=device)
+        self.stops: Any = _numbers(torch.zeros(rows, dtype=torch.int64, device=device))
         self.tables: list[list[dict[str, Any]]] = [[] for _ in range(rows)]
         self._sums = np.zeros((rows, len(self.loops), 3))
         self._decided: _Seen | None = None
@@ -49,8 +54,7 @@ class Counters:
 
     def begin(self, rows: np.ndarray, state: State) -> None:
         """Forget what was counted in some rows (indices), whose episodes begin."""
-        begun = torch.as_tensor(rows, device=self.stops.device)
-        self.stops, self._sums[rows] = self.stops.index_fill(0, begun, 0), 0.0
+        self.stops[rows], self._sums[rows] = 0, 0.0
         for row in rows:
             self.tables[row] = []
         self._decided = _Seen.of(state)
@@ -61,7 +65,7 @@ class Counters:
         last, now = self._decided, _Seen.of(state)
         self._decided = now
         assert last is not None
-        self.stops = self.stops + (last.same(now) & (last.speed >= STANDS) & (now.speed < STANDS)).sum(-1)
+        self.stops = self.stops + (last.same(now) & now.stands & ~last.stands).sum(-1)
 
     def after(self, state: State) -> None:
         """Count who has passed a detector in the step that has led here."""
@@ -69,11 +73,11 @@ class Counters:
         assert self._last is not None and state.lanes is not None
         (last, step_then, then), self._last = self._last, (now, step, position)
         follows, rear = step == step_then + 1, position - state.length
-        same = last.same(now) & follows.unsqueeze(-1)
+        same, present = (torch.as_tensor(x) for x in (last.same(now) & _numbers(follows.unsqueeze(-1)), now.present))
         for i, loop in enumerate(self.loops):
-            on = now.present & (state.lanes.lane == loop.lane) & (position >= loop.place)
+            on = present & (state.lanes.lane == loop.lane) & (position >= loop.place)
             passed = same & on & (then < loop.place)
-            counts = passed.sum(-1), (passed * now.speed).sum(-1), (on & (rear < loop.place)).any(-1)
+            counts = passed.sum(-1), (passed * state.speed.detach()).sum(-1), (on & (rear < loop.place)).any(-1)
             self._sums[:, i] += (follows.unsqueeze(-1) * torch.stack([x.double() for x in counts], -1)).cpu().numpy()
             steps = round(loop.every / self._dt)
             for row in torch.nonzero(follows & (step % steps == 0)).squeeze(-1).tolist():

@@ -113,6 +113,7 @@ class Face(Pictures):
 
     metadata: dict[str, Any]
     _spec: EnvSpec | None = None
+    _flat: tuple[int, ...] = ()
 
     def _take(self, own: Settings, count: int) -> int:
         """Take over what ``count`` environments are made of; return how many agents each has."""
@@ -121,6 +122,12 @@ class Face(Pictures):
         fps = 10.0 if own.render_mode == "rgb_array_list" else 1.0 / self.task.step_time
         self.metadata = {**type(self).metadata, "render_fps": max(1, round(fps))}
         return len(self.task.agents)
+
+    def _out(self, observation: Any) -> Any:
+        """Return observations as they are handed out: flat, and with numpy output nobody else's."""
+        flat = observation.reshape(*self._flat, -1)
+        own = flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
+        return own.copy() if self._numpy else own
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -257,10 +264,6 @@ class DiffIDMEnv(Face, gymnasium.Env):
         value = reward.item() if self._numpy else reward[0]
         ends = terminated.item(), truncated.item()
         return self._out(outcome.observation), value, *ends, single(self.batch, outcome)
-
-    def _out(self, observation: Any) -> Any:
-        flat = observation.reshape(-1)
-        return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
 
     def close(self) -> None:
         """Close the window, if there is one."""

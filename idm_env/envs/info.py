@@ -75,7 +75,8 @@ def begun(batch: Batch) -> dict[str, Any]:
 
 def single(batch: Batch, outcome: Outcome) -> dict[str, Any]:
     """Return the info of a step of a single environment."""
-    info: dict[str, Any] = {name: value[0] for name, value in outcome.details.items()}
+    own, details = batch.settings.output == "numpy", outcome.details.items()
+    info: dict[str, Any] = {name: value[0].copy() if own else value[0] for name, value in details}
     if "crash" in info:
         info["crash"] = bool(info["crash"].any())
     if info.get("crash"):

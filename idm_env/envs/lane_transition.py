@@ -25,7 +25,7 @@ from idm_env.compiled.scalar.record import Form, Unordered, Untraceable, slot_na
 from idm_env.delay_buffer import PAST
 from idm_env.envs.moves import Moves
 from idm_env.envs.transition import CompiledTransition, Tables, WholeStep
-from idm_env.envs.worlds import WHOLE, Array, Group, Layout, Moment, Room, RowTable, address, named, world_of
+from idm_env.envs.worlds import WHOLE, Array, Frame, Group, Layout, Moment, Room, RowTable, address, named, world_of
 from idm_env.multilane.demand import turned
 from idm_env.multilane.incentives import seen_merging
 from idm_env.roads import Lanes
@@ -93,7 +93,8 @@ class Stage:
         """Change some rows (indices): blocks and whole numbers before it, and those after it, begin there."""
         if self._forward[0] is not still:
             self._forward = still, RowTable(self.loops, still, self.plan.groups("") + self.plan.groups("then_"))
-        lane_change_loops.each_row(self.loops.call, rows, self._forward[1].filled(own, *begins))
+        table, _ = self._forward[1].laid(begins, lambda: (own, *begins), own)
+        lane_change_loops.each_row(self.loops.call, rows, table)
 
     def through(
         self, still: Mapping[str, Array], rows: Array, own: Mapping[str, int], begins: Sequence[int], on: Array
@@ -216,7 +217,8 @@ class LaneTransition(CompiledTransition):
         self._absent = np.empty(0, self.real)
         self._turns: dict[WholeStep, Stage] = {}
         self._stages = np.unique(self.deciding.turns) if simulator.decides_in_blocks else np.zeros(1, np.int64)
-        self._spare: Tensor | None = None
+        self._turns_at, self._every = np.append(self._stages, 0)[:, None], simulator.decides_after
+        self._mid = torch.empty(len(self.layout.blocks), self.rows, self.size, dtype=world.state.speed.dtype)
 
     def groups(self, prefix: str) -> tuple[Group, ...]:
         """Return how worlds lie: blocks, and whole numbers."""
@@ -281,66 +283,68 @@ class LaneTransition(CompiledTransition):
 
     def until(self, clock: Array) -> int:
         """Return the number of steps before the next one at which vehicles change lanes, come or go."""
-        every = self.task.simulator.decides_after
-        return int(((np.append(self._stages, 0)[:, None] - clock) % every).min())
+        return int(((self._turns_at - clock) % self._every).min())
 
-    def columns(self, moment: Moment, now: Tensor, begins: Array, later: Array) -> tuple[Array, ...]:
+    def columns(self, moment: Moment, now: Frame, begins: Array, later: Array) -> tuple[Array, ...]:
         """Decide about lanes; return where worlds begin: before decisions, after them, and after each step."""
-        moment.begins = self.begins(moment, now, int(later[0]), True)
+        moment.begins = self._decided(moment, now)
         whole = moment.crossing.later
-        if moment.bound.by_record:
-            whole += [whole[0].copy() for _ in later[1:]]
-        else:
-            whole *= len(later)
+        whole += [whole[0].copy() if moment.bound.by_record else whole[0] for _ in later[1:]]
         after = np.array([address(x) for x in whole])
         blocks, wholes = (
             np.concatenate(([x], y)) for x, y in zip(moment.begins[2:4], (begins[1:], after[:-1]), strict=True)
         )
         return begins, np.concatenate((moment.begins[1:2], after[:-1])), blocks, wholes, later, after
 
-    def begins(self, moment: Moment, now: Tensor, later: int, tape: bool) -> tuple[int, ...]:
-        """Decide about lanes; return where worlds begin: before it, after it, and after the step.
+    def begins(self, moment: Moment, now: Frame, later: Frame) -> tuple[int, ...]:
+        """Decide about lanes; return where worlds begin: before decisions, after them, and after the step.
 
         Unordered, with nothing changed, where links are not the order of positions.
         """
+        return *self._decided(moment, now), later.at, address(moment.crossing.later[0])
+
+    def _decided(self, moment: Moment, now: Frame) -> tuple[int, ...]:
+        """Decide about lanes; return where worlds begin, before it and after it."""
         bound, whole = moment.bound, moment.whole
         assert isinstance(bound, LaneTables) and whole is not None
-        lanes = moment.crossing = Crossing(now, whole, [])
-        phase = moment.clock % self.task.simulator.decides_after
+        lanes = moment.crossing = Crossing(now.blocks, whole, [])
+        phase = moment.clock % self._every
         if bound.recorded in self._turns:
             lanes.turned = np.flatnonzero(phase == 0)
         if self.wishes is not None:
             lanes.decided = np.flatnonzero(np.isin(phase, self._stages) if len(self._stages) > 1 else phase == 0)
-        begins = now.data_ptr(), address(whole)
+        begins = after = now.at, address(whole)
         if len(lanes.turned) or len(lanes.decided):
-            mid = torch.empty_like(now) if tape or self._spare is None else self._spare
-            self._spare = None if tape else mid
-            lanes.mid, lanes.whole_mid = mid.copy_(now.detach()), whole.copy()
-            after, step = (mid.data_ptr(), address(lanes.whole_mid)), {"state_step": moment.given["state_step"]}
+            spare: Any = None if moment.spare is None else (self._mid, moment.spare)
+            lanes.mid, lanes.whole_mid = spare or (torch.empty_like(now.blocks), np.empty_like(whole))
+            lanes.whole_mid[:] = whole
+            lanes.mid.copy_(now.blocks.detach())
+            after, step = (lanes.mid.data_ptr(), address(lanes.whole_mid)), {"state_step": address(moment.clock)}
             if len(lanes.turned):
                 self._turns[bound.recorded].run(bound.still, lanes.turned, step, *begins, *after)
             if len(lanes.decided):
                 self._decide(moment, bound, phase[lanes.decided], begins)
                 self.settle.run(bound.still, lanes.decided, self._decision_inputs(moment), *after, *after)
         lanes.later = [lanes.whole_mid.copy() if bound.by_record else lanes.whole_mid]
-        return *begins, lanes.mid.data_ptr(), address(lanes.whole_mid), later, address(lanes.later[0])
+        return begins + after
 
     def _decision_inputs(self, moment: Moment) -> dict[str, int]:
         """Return the addresses of what ``_settled`` is given beside worlds."""
         own = {"fresh": address(moment.crossing.fresh), "merger": address(moment.crossing.merger)}
-        return own | {"state_step": moment.given["state_step"]}
+        return own | {"state_step": address(moment.clock)}
 
-    def _decide(self, moment: Moment, bound: LaneTables, stages: Array, begins: Sequence[int]) -> None:
+    def _decide(self, moment: Moment, bound: LaneTables, stages: Array, begins: tuple[int, ...]) -> None:
         """Let vehicles change lanes, in the worlds after some have come and gone."""
         lanes = moment.crossing
         plan, places, which, offsets, inputs, marks = bound.decides
         plan[which, lane_change_loops.ADDRESS] = offsets + lanes.mid.data_ptr()
         bound.clock[:] = moment.clock
         if inputs:
-            self.commands.loops.run(0, self.rows, bound.ask.pointer(moment.given, tuple(begins)))
+            pointers = self.pointers(moment)
+            self.commands.loops.run(0, self.rows, bound.ask.laid(begins, lambda: (pointers, *begins), pointers)[1])
             for i, name in inputs:
                 where = self.commands.arrays.get(name)
-                plan[i, lane_change_loops.ADDRESS] = moment.given[name] if where is None else address(where)
+                plan[i, lane_change_loops.ADDRESS] = pointers[name] if where is None else address(where)
         if not self.ring:
             lane_change_loops.mark_led(lanes.decided, self.size, *lanes.whole_mid[1:3], marks["led"], marks["leads"])
         blocks = dict(zip(self.layout.blocks, lanes.mid.view(len(lanes.mid), -1).numpy(), strict=True))
@@ -360,7 +364,7 @@ class LaneTransition(CompiledTransition):
             mid = lanes.mid.data_ptr(), address(lanes.whole_mid)
             between, _ = self.settle.through(bound.still, lanes.decided, self._decision_inputs(moment), mid, between)
         if len(lanes.turned):
-            step = {"state_step": moment.given["state_step"]}
+            step = {"state_step": address(moment.clock)}
             turn = self._turns[bound.recorded]
             between, more = turn.through(bound.still, lanes.turned, step, moment.begins[:2], between)
             on_parameters += more

@@ -109,10 +109,10 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
             self.batch.seed([0], [seeding.np_random(None if seed is None else whole("seed", seed, 0))[1]])
         # PettingZoo's own tests set it between episodes.
         self.batch.limit = self.max_cycles
-        seen = np.asarray(self.batch.reset(state=chosen.get("state"))[0])
+        seen = np.asarray(self.batch.reset(state=chosen.get("state"))[0]).copy()
         self.agents = self._appear()
         while not self.agents:
-            seen = np.asarray(self.batch.step(None).observation[0])
+            seen = np.array(self.batch.step(None).observation[0])
             self.agents = self._appear()
         self._watch(1)
         return self._by_agent(seen), {agent: self._begun(i) for i, agent in enumerate(self._slots) if agent}
@@ -140,7 +140,7 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
                 torch.from_numpy(commands.reshape(1, -1)).to(self.settings.device) if any(act) else None,
                 None if all(act) or not any(act) else torch.tensor([act], device=self.settings.device),
             )
-        observations = self._by_agent(np.asarray(outcome.observation[0]))
+        observations = self._by_agent(np.array(outcome.observation[0]))
         rewards, terminated, truncated = (self._by_agent(x[0].tolist()) for x in outcome[1:4])
         infos = {agent: self._info(i, outcome) for i, agent in enumerate(before) if live[i]}
         self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
@@ -175,7 +175,7 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
             now = self._appear()
         for i, agent in enumerate(self._slots):
             if agent and agent not in self.agents:
-                seen[agent], infos[agent] = np.asarray(outcome.observation[0, i]), self._info(i, outcome)
+                seen[agent], infos[agent] = np.array(outcome.observation[0, i]), self._info(i, outcome)
                 rewards[agent], terminated[agent], truncated[agent] = 0.0, False, False
         self.agents = now
 

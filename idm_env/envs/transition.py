@@ -26,16 +26,16 @@ from idm_env.compiled.kernels.window_loop import each_table
 from idm_env.compiled.scalar.record import Unordered, Untraceable
 from idm_env.delay_buffer import PAST
 from idm_env.envs.moves import Moves
-from idm_env.envs.past import ROOM
+from idm_env.envs.past import ROOM, Array
 from idm_env.envs.settings import INFO
-from idm_env.envs.worlds import WHOLE, Array, Layout, Moment, Room, RowTable, address, named, row_addresses, world_of
+from idm_env.envs.worlds import WHOLE, Frame, Layout, Moment, Room, RowTable, address, named, row_addresses, world_of
 from idm_env.tasks import EnvState
 from idm_env.types import Params, State
 
 _ROWS = (1009, 1013, 1019, 1021, 1031)
 """Numbers of rows of a recording: one that is no other dimension tells rows apart from everything else."""
-_BLOCK, _PAST = 8, ("past", "then_past")
-"""Rows that do all steps of an action before the next ones, and what steps read and write of the past."""
+_BLOCK = 8
+"""Rows that do all steps of an action before the next ones."""
 
 Form = tuple[tuple[str, str, bool, bool], ...]
 """Parameters as a recording knows them: effect, name, whether vehicles differ, and whether a gradient is wanted."""
@@ -48,15 +48,9 @@ class WholeStep:
     """
 
     def __init__(
-        self,
-        moves: Moves,
-        world: EnvState,
-        blocks: Sequence[str],
-        kind: tuple[bool, bool],
-        draws: Sequence[str],
-        form: Form,
+        self, moves: Moves, world: EnvState, layout: Layout, kind: tuple[bool, bool], draws: Sequence[str], form: Form
     ) -> None:
-        (idle, every), task, like = kind, moves.task, world.state
+        (idle, every), task, like, blocks = kind, moves.task, world.state, layout.blocks
         self._world, self._blocks, self._draws = world, blocks, tuple(draws)
         size, agents = like.speed.shape[-1], len(task.agents)
         many = self.many = next(p for p in _ROWS if p not in (size, agents))
@@ -108,14 +102,12 @@ class WholeStep:
             return self._stepper.step(driving, inputs, params)
 
         normals = {n: leaves[f"normal_{n}"] for n in self._draws} or None
-        after, outputs = self._moves.by(drive).step(
-            world, leaves.get("action"), leaves.get("live"), normals, self.params_of(leaves)
-        )
+        operands = leaves.get("action"), leaves.get("live"), normals, self.params_of(leaves)
+        after, outputs = self._moves.by(drive).step(world, *operands)
         later = named(after)
         out = {f"then_{n}": later[n] for n in self._blocks} | outputs | {"clock": after.state.step}
-        out |= {
-            f"then_{n}": later[n] for n in self.changing[len(self._blocks) :] if storage(later[n]) != storage(mid[n])
-        }
+        whole = self.changing[len(self._blocks) :]
+        out |= {f"then_{n}": later[n] for n in whole if storage(later[n]) != storage(mid[n])}
         if task.journeys:
             out["on_road"] = task.there(after.state, torch.ones_like(outputs["terminated"]))
         return out | ({"then_past": self._stepper.looked[0].now} if "past" in leaves else {})  # type: ignore[return-value]
@@ -184,7 +176,8 @@ class Tables:
         self._watched = [(own, p, x, x._version) for own in params.values() for p, x in own.items()]
         names = [recorded.parameters[n] for n in recorded.wanted]
         self.wanted = [(i, params[e][p]) for i, (e, p) in enumerate(names)]
-        self.room = Room({n: (plan.rows, *recorded.forward.shapes[n]) for n in recorded.told}, recorded.forward.types)
+        shapes = {n: (plan.rows, *recorded.forward.shapes[n]) for n in recorded.told if n != "clock"}
+        self.room = Room(shapes, recorded.forward.types)
 
     def _array(self, x: Tensor) -> Array:
         wide = self.plan.size if _wide(x) else 1
@@ -202,12 +195,12 @@ class Tables:
         return RowTable(self.recorded.forward, self.still | self.room.arrays, self._forward)
 
     @cached_property
-    def together(self) -> tuple[Tensor, dict[str, Array], dict[str, Array]]:
-        """Memory for the steps of one action: worlds, what is told after each ``[steps, …]``, and where that begins."""
+    def together(self) -> tuple[Tensor, Array, dict[str, Array], dict[str, Array]]:
+        """Memory for the steps of one action: worlds, clocks, what is told ``[steps, …]``, and where that begins."""
         steps, world = self.plan.task.held, (len(self.layout.blocks), self.plan.rows, self.plan.size)
-        outputs, numbers = self.room.take(steps), np.arange(steps)
-        places = {n: row_addresses(x, numbers) for n, x in outputs.items()}
-        return torch.from_numpy(np.empty((steps, *world), self.plan.real)), outputs, places
+        outputs, clocks = self.room.take(steps), np.empty((steps, self.plan.rows), np.int64)
+        places = {n: row_addresses(x, np.arange(steps)) for n, x in (outputs | {"clock": clocks}).items()}
+        return torch.from_numpy(np.empty((steps, *world), self.plan.real)), clocks, outputs, places
 
     @cached_property
     def back(self) -> RowTable:
@@ -262,9 +255,20 @@ class CompiledTransition:
         self._kind, self._draws, self._recorded = kind, draws, dict[Form, WholeStep]()
         self._bound: Tables | None = None
         self._normals: dict[str, tuple[Array, int]] = {}
-        self._looks = [np.full(self.rows, flag) for flag in (False, True)]
+        self._places: tuple[Array | None, ...] | None = None
+        self._looked = np.full(self.rows, True), np.full(self.rows, False)
+        self._looks = [address(x) for x in self._looked]
         self.threads = 1 if self.count < 2 * pool.GRAIN else pool.count(self.count)
         self.before = tuple(group for prefix in self.worlds for group in self.groups(prefix))
+
+    def placed(self, *given: Any) -> tuple[Array | None, ...]:
+        """Return actions and who acts, None where nobody does or all do, in memory that stays."""
+        if self._places is None:
+            self._places = tuple(None if x is None else np.asarray(x).copy() for x in given)
+        for held, x in zip(self._places, given, strict=True):
+            if held is not None:
+                held[:] = x
+        return self._places
 
     def groups(self, prefix: str) -> tuple[tuple[str, Sequence[str], int], ...]:
         """Return how worlds lie, whose leaves have names that begin so."""
@@ -274,8 +278,7 @@ class CompiledTransition:
         """Return the step as recorded for such parameters; Unordered, if it changes its own values by being called."""
         form = tuple((e, p, _wide(x), x.requires_grad) for e, own in params.items() for p, x in own.items())
         if form not in self._recorded:
-            blocks = self.layout.blocks
-            step = WholeStep(self.moves, self.world, blocks, self._kind, self._draws, form)
+            step = WholeStep(self.moves, self.world, self.layout, self._kind, self._draws, form)
             if self.reads is not None and self.reads.watches:
                 step.refuse_chance(self.graph)
                 if self.reads.changed():
@@ -296,45 +299,51 @@ class CompiledTransition:
 
     # -- forwards ------------------------------------------------------------------------------------------------
 
-    def run(self, moment: Moment, now: Tensor, later: Tensor, tape: bool) -> dict[str, Array]:
-        """Do one step from blocks to blocks; return what is told.
+    def run(self, moment: Moment, now: Frame, later: Frame, stays: bool) -> dict[str, Array]:
+        """Do one step; return what is told, until the next call.
 
+        ``stays`` says that worlds take turns in two places; else nothing that a step has read is written to later.
         Untraceable where an effect of the user's own returned NaN.
         """
         bound = moment.bound
-        assert isinstance(bound, Tables)
-        moment.given = self.pointers(moment)
-        moment.begins = self.begins(moment, now, later.data_ptr(), tape)
-        self.split(bound.recorded.forward, bound.once.pointer(moment.given, moment.begins))
-        self.refuse_nan(later)
-        return {n: x.copy() for n, x in bound.room.arrays.items()}
+        begins = moment.begins = self.begins(moment, now, later)
+        clock = {"clock": later.clock_at}
+        moment.given = self.moving(moment) if stays else self.pointers(moment) | clock
+        _, where = bound.once.laid(begins, lambda: (self.pointers(moment) | clock, *begins), moment.given)
+        self.split(bound.recorded.forward, where)
+        self.refuse_nan(later.blocks)
+        return bound.room.arrays
 
     def refuse_nan(self, worlds: Tensor) -> None:
         """Raise Untraceable where an effect of the user's own returned NaN: blocks ``[…, blocks, rows, vehicles]``."""
         if self.task.simulator.own and bool(worlds[..., self.layout.blocks.index("state_speed"), :, :].isnan().any()):
             raise Untraceable("an effect returned nan: the step itself tells which")
 
-    def run_together(self, moment: Moment, now: Tensor, first: int, steps: int) -> None:
+    def run_together(self, moment: Moment, now: Frame, first: int, steps: int) -> None:
         """Do some steps under one action, of which only the first changes lanes; ``first`` is its number in memory."""
-        bound, part, count = moment.bound, slice(first, first + steps), np.arange(steps)
-        worlds, _, places = bound.together
-        cells = self.spread(moment, count) | {n: x[part] for n, x in places.items()}
-        cells["state_step"][1:] = cells["clock"][:-1]
+        bound, count = moment.bound, np.arange(steps)
+        worlds, _, _, places = bound.together
         later = worlds.data_ptr() + (first + count) * (worlds.shape[1] * self.pitch)
-        begins = np.concatenate(([now.data_ptr()], later[:-1]))
-        tables = bound.ahead.filled(cells, *self.columns(moment, now, begins, later))
+        begins = self.columns(moment, now, np.concatenate(([now.at], later[:-1])), later)
+        moving = self.moving(moment, count)
+
+        def lay() -> tuple[Any, ...]:
+            cells = self.pointers(moment) | moving | {n: x[first : first + steps] for n, x in places.items()}
+            return cells | {"state_step": np.concatenate(([now.clock_at], cells["clock"][:-1]))}, *begins
+
+        tables, _ = bound.ahead.laid(tuple(x.tobytes() for x in begins), lay, moving)
         some = partial(each_table, bound.recorded.forward.call, _BLOCK, tables)
         pool.split(some, self.rows, 1, self.threads)
 
-    def begins(self, moment: Moment, now: Tensor, later: int, tape: bool) -> tuple[int, ...]:
+    def begins(self, moment: Moment, now: Frame, later: Frame) -> tuple[int, ...]:
         """Return where the worlds of a step begin (``before``), and those after it."""
-        return now.data_ptr(), later
+        return now.at, later.at
 
     def until(self, clock: Array) -> int:
         """Return the number of steps before the next one at which vehicles change lanes, come or go."""
         return 1 << 40
 
-    def columns(self, moment: Moment, now: Tensor, begins: Array, later: Array) -> tuple[Array, ...]:
+    def columns(self, moment: Moment, now: Frame, begins: Array, later: Array) -> tuple[Array, ...]:
         """Return where the worlds of some steps begin, and those after them; ``moment`` is the first of these steps.
 
         ``now`` are the worlds before it, and no other one changes lanes.
@@ -343,35 +352,26 @@ class CompiledTransition:
 
     def split(self, loops: RowFunction, where: int) -> None:
         """Do the loops over all rows, with a table at an address, in some threads where there are many."""
-        if self.threads == 1:
-            loops.run(0, self.rows, where)
-        else:
-            pool.split(lambda begin, end: loops.run(begin, end, where), self.rows, 1, self.threads)
+        pool.split(lambda begin, end: loops.run(begin, end, where), self.rows, 1, self.threads)
 
     def pointers(self, moment: Moment) -> dict[str, int]:
         """Return the addresses of all that a step is given beside its worlds: its adjoint is given the same."""
-        looks = address(self._looks[moment.looks % self.task.held == 0])
-        pointers = {"state_step": address(moment.clock), "looks": looks}
-        if moment.action is not None:
-            pointers["action"] = address(moment.action)
-        if moment.live is not None:
-            pointers["live"] = address(moment.live)
+        own = {"action": moment.action, "live": moment.live, "state_step": moment.clock}
+        return {n: address(x) for n, x in own.items() if x is not None} | self.moving(moment)
+
+    def moving(self, moment: Moment, count: Any = 0) -> dict[str, Any]:
+        """Return the addresses of that of it which lies elsewhere at every step, ``count`` steps after the first."""
+        pointers: dict[str, Any] = {}
         for name, x in (moment.normals or {}).items():
             if name not in self._normals or self._normals[name][0] is not x:
                 self._normals[name] = x, address(x)
-            pointers[f"normal_{name}"] = self._normals[name][1] + moment.at * self.pitch
+            pointers[f"normal_{name}"] = self._normals[name][1] + (moment.at + count) * self.pitch
         if self.past_shape:
-            pointers["past"] = address(moment.past) + moment.newest * self.slot
+            pointers["past"] = address(moment.past) + (moment.newest - count) * self.slot
             pointers["then_past"] = pointers["past"] - self.slot
+        if self.task.held > 1:
+            pointers["looks"] = np.where((count - moment.looks) % self.task.held == 0, *self._looks)
         return pointers
-
-    def spread(self, moment: Moment, count: Array) -> dict[str, Array]:
-        """Return the addresses of what steps are given that come ``count`` steps after the first one."""
-        moment.given = self.pointers(moment)
-        apart = {f"normal_{n}": self.pitch for n in moment.normals or ()} | dict.fromkeys(_PAST, -self.slot)
-        pointers = {n: x + count * apart.get(n, 0) for n, x in moment.given.items()}
-        looks = (count - moment.looks) % self.task.held == 0
-        return pointers | {"looks": np.where(looks, *(address(x) for x in self._looks[::-1]))}
 
     # -- backwards -----------------------------------------------------------------------------------------------
 
@@ -391,7 +391,6 @@ class CompiledTransition:
         the past (rows, slots, signals, vehicles); None is nothing.
         """
         bound, zeros = moment.bound, address(self.zeros)
-        assert isinstance(bound, Tables)
         on_worlds = np.empty((len(self.worlds), len(self.layout.blocks), self.count), self.real)
         on_action = None if moment.action is None else np.zeros(moment.action.shape, self.real)
         on_parameters = np.empty((len(bound.wanted), self.count), self.real)
@@ -404,7 +403,8 @@ class CompiledTransition:
             pointers |= {"on_past": address(on_past), "to_past": address(before)}
         seeds = zeros if on_later is None else on_later.data_ptr()
         begins = *moment.begins[: len(self.before)], seeds, *(address(x) for x in on_worlds), address(on_parameters)
-        self.split(bound.recorded.backward, bound.back.pointer(pointers, begins))
+        cells = bound.back.filled(pointers, *begins)
+        self.split(bound.recorded.backward, address(cells))
         return self.first(moment, [*on_worlds], on_parameters), on_action, on_parameters, before
 
     def first(self, moment: Moment, on_worlds: Sequence[Array], on_parameters: Array) -> Array:

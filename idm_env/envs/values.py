@@ -22,7 +22,7 @@ from idm_env.envs.lane_transition import LaneTransition
 from idm_env.envs.moves import Moves
 from idm_env.envs.past import Past
 from idm_env.envs.transition import CompiledTransition, Tables
-from idm_env.envs.worlds import WHOLE, Array, Layout, Moment, named, world_of
+from idm_env.envs.worlds import WHOLE, Array, Frame, Layout, Moment, named, world_of
 from idm_env.tasks import EnvState
 from idm_env.types import Params, mapped
 
@@ -48,15 +48,12 @@ class Values:
         self._steady = _WORTHWHILE
         self._key: Any = None
         self.layout = Layout((), {}, 0)
-        self.blocks: Tensor
-        self._spare: Tensor | None = None
+        self.now: Frame
+        self._spare: Frame
+        self._wholes: dict[int, Array] = {}
         self._token: Tensor | None = None
-        self._clock: Array
-        self.whole: Array | None = None
         self.past: Past
         self._world: EnvState
-        self._glance: EnvState | None = None
-        self._views: tuple[Layout | None, dict[str, Tensor]] = None, {}
 
     # -- worlds --------------------------------------------------------------------------------------------------
 
@@ -65,23 +62,26 @@ class Values:
 
         Untraceable where something carries a graph that no step changes.
         """
-        leaves, self._glance = named(world), None
+        leaves = named(world)
         key = (world.state.speed.shape, world.state.speed.dtype, tuple(world.state.memory), tuple(world.episode))
         blocks = tuple(n for n in leaves if n in _DYNAMIC or n.startswith("memory_"))
         fixed = next((n for n, x in leaves.items() if x.requires_grad and n not in blocks), None)
         if fixed is not None:
             raise Untraceable(f"{fixed.replace('_', '.', 1)} carries a graph")
-        if key != self._key:
-            self._plans, self._spare = {}, None
-        self._key, self._world = key, mapped(lambda x: x.detach(), world)
+        self._world, stays = mapped(lambda x: x.detach(), world), key == self._key and not self._graph
         still = {n: np.array(x.numpy(), order="C").reshape(-1) for n, x in leaves.items() if n not in blocks}
-        self._clock = still.pop("state_step")
-        whole = [still.pop(n) for n in WHOLE if n in still]
-        self.whole = np.stack(whole) if whole else None
+        clock, whole = still.pop("state_step"), [still.pop(n) for n in WHOLE if n in still]
         old = self.layout.still
         if still.keys() != old.keys() or not all(np.array_equal(x, old[n]) for n, x in still.items()):
             self.layout = Layout(blocks, still, self.layout.version + 1)
-        self.blocks = _block(world, self.layout.blocks)
+        now = Frame(_block(world, blocks), clock, np.stack(whole) if whole else None)
+        if stays:
+            self.now.take(now)
+        else:
+            empty = torch.empty_like(now.blocks), clock.copy(), None if now.whole is None else now.whole.copy()
+            self.now, self._spare, self._wholes = now, Frame(*empty), {}
+        if key != self._key:
+            self._key, self._plans = key, {}
         self.past = Past(world.state, writes_once=self._graph)
         self.past.load(world.state)
         past = world.state.memory.get(PAST)
@@ -92,23 +92,22 @@ class Values:
     def replace(self, rows: Array, fresh: EnvState) -> None:
         """Replace some rows (indices) by the worlds of ``fresh``, with their graph; that of the rows before is cut."""
         index, blocks = torch.from_numpy(np.asarray(rows)), _block(fresh, self.layout.blocks)
-        leaves, self._glance = {n: x.detach().numpy() for n, x in named(fresh).items()}, None
+        leaves, now = {n: x.detach().numpy() for n, x in named(fresh).items()}, self.now
         if self._graph:
-            self.blocks = self.blocks.index_copy(1, index, blocks)
-            self._clock, self.past = self._clock.copy(), self.past.copy()
+            whole = None if now.whole is None else now.whole.copy()
+            self.now = now = Frame(now.blocks.index_copy(1, index, blocks), now.clock.copy(), whole)
+            self.past = self.past.copy()
             if self._token is not None:
                 self._token = _Forget.apply(self._token, index)
         else:
-            self.blocks[:, index] = blocks
-        self._clock[rows] = leaves["state_step"]
+            now.blocks[:, index] = blocks
+        now.clock[rows] = leaves["state_step"]
         self.past.replace(rows, fresh.state)
-        if self.whole is not None:
-            self.whole = self.whole.copy()
-            for i, name in enumerate(n for n in WHOLE if n in leaves):
-                self.whole[i].reshape(len(self._clock), -1)[rows] = leaves[name]
+        for name, held in zip([n for n in WHOLE if n in leaves], () if now.whole is None else now.whole, strict=True):
+            held.reshape(len(now.clock), -1)[rows] = leaves[name]
         for name, held in self.layout.still.items():
             values = leaves[name]
-            old = held.reshape(len(self._clock), *values.shape[1:])
+            old = held.reshape(len(now.clock), *values.shape[1:])
             if np.array_equal(old[rows], values):
                 continue
             if self._graph:
@@ -120,30 +119,24 @@ class Values:
 
     def current(self) -> EnvState:
         """Return the worlds as tensors of their own."""
-        layout = self.layout._replace(still={n: x.copy() for n, x in self.layout.still.items()})
-        whole = None if self.whole is None else self.whole.copy()
+        now, layout = self.now, self.layout._replace(still={n: x.copy() for n, x in self.layout.still.items()})
         past = self.past.tensor() if self.past.slots else None
         if past is not None and self._token is not None:
             past = _Leave.apply(self._token, past)
-        held = self.blocks if self._graph else self.blocks.clone()
-        return _world(self._world, layout, _views(self._world, layout), held, self._clock.copy(), past, whole)
+        whole, blocks = None if now.whole is None else now.whole.copy(), now.blocks
+        return _world(self._world, layout, blocks if self._graph else blocks.clone(), now.clock.copy(), past, whole)
 
     def glance(self) -> EnvState:
         """Return the worlds as views until the next step, without graph and past: the same until then."""
-        if self._glance is None:
-            if self._views[0] is not self.layout:
-                self._views = self.layout, _views(self._world, self.layout)
-            held = self.blocks.detach()
-            self._glance = _world(self._world, *self._views, held, self._clock, None, self.whole)
-        return self._glance
+        now = self.now
+        if now.views[0] is not self.layout or now.views[1] is not now.whole:
+            world = _world(self._world, self.layout, now.blocks.detach(), now.clock, None, now.whole)
+            now.views = self.layout, now.whole, world
+        return now.views[2]  # type: ignore[no-any-return]
 
     def detach(self) -> None:
         """Cut the graph behind the worlds."""
-        self.blocks, self._token, self._glance = self.blocks.detach(), None, None
-
-    def clock(self) -> Tensor:
-        """Return the steps of all rows, as they are now."""
-        return torch.from_numpy(self._clock)
+        self.now, self._token = Frame(self.now.blocks.detach(), self.now.clock, self.now.whole), None
 
     # -- steps ---------------------------------------------------------------------------------------------------
 
@@ -156,29 +149,27 @@ class Values:
         Unless anybody ``looks``, observations and most infos are told only of rows whose episodes end. ``live`` says
         whose actions count (all, where it is None). Arrays are told; tensors where there may be a graph.
         """
-        plan = self.plan((action is None, live is None), tuple(normals or ()))
-        bound = plan.of(self.layout, params)
-        if self.past.slots:
-            self.past.room()
-        past = self.past
-        parts = self._clock, _in_rows(action), live, normals, at, past.numbers, past.newest, bound, self.whole
-        moment = Moment(*parts, looks=int(not looks))
-        outputs: dict[str, Any]
-        if self._graph and torch.is_grad_enabled() and self._differentiated(action, bound):
-            outputs = self._noted(plan, moment, action, bound)
+        plan, past = self.plan((action is None, live is None), tuple(normals or ())), self.past
+        bound, now, stays = plan.of(self.layout, params), self.now, not self._graph
+        if past.slots:
+            past.room()
+        act, who = plan.placed(action, live) if stays else (_in_rows(action), live)
+        later = self._spare if stays else Frame(torch.empty_like(now.blocks), np.empty_like(now.clock))
+        lanes = bound, now.whole, None, later.whole, int(not looks)
+        moment, token = Moment(now.clock, act, who, normals, at, past.numbers, past.newest, *lanes), None
+        if not stays and torch.is_grad_enabled() and self._differentiated(action, bound):
+            outputs, token = self._noted(plan, moment, later, action)
         else:
-            later = self._spare if self._spare is not None else torch.empty_like(self.blocks)
-            outputs = plan.run(moment, self.blocks, later, tape=False)
-            self._spare = None if self._graph else self.blocks
-            self.blocks, self._token = later, None
-            if self._graph:
-                clock = outputs.pop("clock")
-                outputs = {n: torch.from_numpy(x) for n, x in outputs.items()} | {"clock": clock}
-        self._clock, self._glance = outputs.pop("clock"), None
-        if moment.crossing is not None:
-            self.whole = moment.crossing.later[0]
-        if self.past.slots:
-            self.past.newest -= 1
+            outputs = plan.run(moment, now, later, stays)
+            if not stays:
+                outputs = {n: torch.from_numpy(x.copy()) for n, x in outputs.items()}
+        whole = None if moment.crossing is None else moment.crossing.later[0]
+        if stays and whole is now.whole:
+            now.whole = later.whole
+        later.whole = whole
+        self.now, self._spare, self._token = later, now if stays else self._spare, token
+        if past.slots:
+            past.newest -= 1
         return outputs
 
     def hold(
@@ -191,47 +182,45 @@ class Values:
         ``[steps, rows, …]``, until the next call, and how many were done: at least one.
         """
         plan, past = self.plan((action is None, live is None), tuple(normals or ())), self.past
-        bound, command, looks = plan.of(self.layout, params), _in_rows(action), steps - 1
+        bound, (act, who), looks = plan.of(self.layout, params), plan.placed(action, live), steps - 1
         steps = min(steps, most, past.room()) if past.slots else min(steps, most)
-        (worlds, outputs, _), done, whole = bound.together, 0, list[Array | None]()
-        now, clock, lanes = self.blocks, self._clock, self.whole
+        (worlds, clocks, outputs, _), done, whole = bound.together, 0, list[Array | None]()
+        now, later = self.now, self._spare
         while done < steps:
-            count = min(steps - done, 1 + plan.until(clock + 1))
-            parts = clock, command, live, normals, at + done, past.numbers, past.newest - done, bound, lanes
-            moment = Moment(*parts, looks=looks - done)
+            count = min(steps - done, 1 + plan.until(now.clock + 1))
+            # Any of them may be the last one that counts.
+            own = None if now.whole is None else self._wholes.setdefault(done, np.empty_like(now.whole))
+            lanes = bound, now.whole, None, own, looks - done
+            moment = Moment(now.clock, act, who, normals, at + done, past.numbers, past.newest - done, *lanes)
             plan.run_together(moment, now, done, count)
             whole += [None] * count if moment.crossing is None else moment.crossing.later
             done += count
-            now, clock, lanes = worlds[done - 1], outputs["clock"][done - 1], whole[-1]
+            now = Frame(worlds[done - 1], clocks[done - 1], whole[-1])
         over = (outputs["whole_terminated"] | outputs["whole_truncated"])[:steps].any(1)
         done = int(over.argmax()) + 1 if over.any() else steps
         plan.refuse_nan(worlds[:done])
-        later = self._spare if self._spare is not None else torch.empty_like(self.blocks)
-        self._spare = self.blocks
+        later.take(Frame(worlds[done - 1], clocks[done - 1], whole[done - 1]))
+        self.now, self._spare, self._token = later, self.now, None
         past.newest -= done if past.slots else 0
-        self.arrive(later.copy_(worlds[done - 1]), outputs["clock"][done - 1].copy(), whole=whole[done - 1])
         return outputs, done
 
     def arrive(self, blocks: Tensor, clock: Array, token: Tensor | None = None, whole: Array | None = None) -> None:
         """Go on from other worlds of the same episodes; whole numbers stay, where there are no others."""
-        self.blocks, self._clock, self._token, self._glance = blocks, clock, token, None
-        self.whole = self.whole if whole is None else whole
+        self.now, self._token = Frame(blocks, clock, self.now.whole if whole is None else whole), token
 
     def token_of(self, plan: CompiledTransition) -> Tensor | None:
         """Return the token that stands for the past, if there is one."""
         if self._token is None and self.past.slots:
-            return self.blocks.new_zeros(1).expand(plan.past_shape)
+            return self.now.blocks.new_zeros(1).expand(plan.past_shape)
         return self._token
 
     def mark(self) -> tuple[Any, ...]:
         """Return what ``back_to`` goes back to."""
-        past = self.past
-        return self.blocks, self._clock, self.whole, self._token, self.layout, past, past.numbers, past.newest
+        return self.now, self._token, self.layout, self.past, self.past.numbers, self.past.newest
 
     def back_to(self, mark: tuple[Any, ...]) -> None:
         """Go back to the worlds as they were: steps have written nothing that these read."""
-        self.blocks, self._clock, self.whole, self._token, self.layout, self.past, *past = mark
-        (self.past.numbers, self.past.newest), self._glance = past, None
+        self.now, self._token, self.layout, self.past, self.past.numbers, self.past.newest = mark
 
     def plan(self, kind: tuple[bool, bool], draws: tuple[str, ...], steps: int = 1) -> CompiledTransition:
         """Return the transition of a kind, made once; ``steps`` is how many of them are to be done.
@@ -257,47 +246,41 @@ class Values:
         return plan
 
     def _differentiated(self, action: Any, bound: Tables) -> bool:
-        return bool(
-            self.blocks.requires_grad
-            or self._token is not None
-            or bound.wanted
-            or (isinstance(action, Tensor) and action.requires_grad)
-        )
+        sources = [self.now.blocks, action] if isinstance(action, Tensor) else [self.now.blocks]
+        return self._token is not None or bool(bound.wanted) or any(x.requires_grad for x in sources)
 
-    def _noted(self, plan: CompiledTransition, moment: Moment, action: Any, bound: Tables) -> dict[str, Any]:
-        """Do a step as a node of autograd."""
+    def _noted(
+        self, plan: CompiledTransition, moment: Moment, later: Frame, action: Any
+    ) -> tuple[dict[str, Any], Tensor | None]:
+        """Do a step as a node of autograd; return what is told, and the token that stands for the past then."""
         outputs: dict[str, Any] = {}
-        parameters = [x for _, x in bound.wanted]
-        token = self.token_of(plan)
-        out = _Step.apply(plan, moment, outputs, self.blocks, action, token, *parameters)
-        self.blocks = out[0]
-        self._token = out[1] if self.past.slots else None
+        parameters = [x for _, x in moment.bound.wanted]
+        out = _Step.apply(plan, moment, later, outputs, self.now.blocks, action, self.token_of(plan), *parameters)
+        later.blocks = out[0]
         outputs.update(zip(moment.bound.recorded.flowing, out[2:], strict=True))
-        return outputs
+        return outputs, out[1] if self.past.slots else None
 
 
 class _Step(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, plan: CompiledTransition, moment: Moment, told: dict[str, Any], blocks: Tensor, action: Tensor | None,
-        token: Tensor | None, *wanted: Tensor,
+        ctx: Any, plan: CompiledTransition, moment: Moment, later: Frame, told: dict[str, Any], blocks: Tensor,
+        action: Tensor | None, token: Tensor | None, *wanted: Tensor,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
-        later = torch.empty_like(blocks)
-        arrays = plan.run(moment, blocks, later, tape=True)
-        told["clock"] = arrays.pop("clock")
-        told.update({n: torch.from_numpy(x) for n, x in arrays.items()})
+        arrays = plan.run(moment, Frame(blocks, moment.clock), later, stays=False)
+        told.update({n: torch.from_numpy(x.copy()) for n, x in arrays.items()})
         ctx.plan, ctx.moment = plan, moment
-        ctx.save_for_backward(blocks, later, action, token, *wanted)
+        ctx.save_for_backward(blocks, later.blocks, action, token, *wanted)
         ctx.set_materialize_grads(False)
         past = None if token is None else token_like(token)
-        return (later, past, *(told[n] for n in moment.bound.recorded.flowing))
+        return (later.blocks, past, *(told[n] for n in moment.bound.recorded.flowing))
 
     @staticmethod
     def backward(ctx: Any, on_later: Tensor | None, on_past: Tensor | None, *on_told: Tensor | None) -> Any:  # type: ignore[override]
         plan, moment = ctx.plan, ctx.moment
         blocks, _, action, token, *parameters = ctx.saved_tensors
         if torch.is_grad_enabled():
-            return (None,) * 3 + _twice(ctx, blocks, action, token, parameters, (on_later, on_past, *on_told))
+            return (None,) * 4 + _twice(ctx, blocks, action, token, parameters, (on_later, on_past, *on_told))
         names = moment.bound.recorded.flowing
         seeds = {n: None if x is None else x.contiguous() for n, x in zip(names, on_told, strict=True)}
         later = None if on_later is None else on_later.contiguous()
@@ -308,7 +291,7 @@ class _Step(torch.autograd.Function):
         gradients.append(None if token is None else torch.from_numpy(before))
         for i, x in moment.bound.wanted:
             gradients.append(torch.from_numpy(on_parameters[i]).view(shape[1:]).sum_to_size(x.shape).to(x.dtype))
-        return (None,) * 3 + tuple(gradients)
+        return (None,) * 4 + tuple(gradients)
 
 
 def _twice(
@@ -323,7 +306,7 @@ def _twice(
         recent = moment.past[:, moment.newest : moment.newest + plan.past_shape[1]]
         past = torch.from_numpy(recent.copy()).movedim(-1, 1)
         past = past if token is None else _Leave.apply(token, past)
-    world = _world(plan.world, layout, _views(plan.world, layout), blocks, moment.clock, past, moment.whole)
+    world = _world(plan.world, layout, blocks, moment.clock, past, moment.whole)
     live = None if moment.live is None else torch.from_numpy(moment.live).view(shape[0], -1)
     normals = {n: torch.from_numpy(x).view(-1, *shape)[moment.at] for n, x in (moment.normals or {}).items()} or None
     after, outcome = plan.moves.step(world, action, live, normals, moment.bound.with_values(parameters))
@@ -339,18 +322,12 @@ def _twice(
     return tuple(next(gradients) if flows else None for flows in differentiated)
 
 
-def _views(like: EnvState, layout: Layout) -> dict[str, Tensor]:
-    """Return constant leaves of worlds as tensors of their shapes that share the memory of the layout."""
-    return {n: torch.from_numpy(layout.still[n]).view(x.shape) for n, x in named(like).items() if n in layout.still}
-
-
 def _world(
-    like: EnvState, layout: Layout | None, still: Mapping[str, Tensor], blocks: Tensor, clock: Array,
-    past: Tensor | None, whole: Array | None = None,
-) -> EnvState:  # fmt: skip
-    """Return worlds as tensors that share the memory given."""
-    assert layout is not None
-    leaves = {**still, **dict(zip(layout.blocks, blocks, strict=True))}
+    like: EnvState, layout: Layout, blocks: Tensor, clock: Array, past: Tensor | None, whole: Array | None = None
+) -> EnvState:
+    """Return worlds as tensors that share the memory given, and that of the layout."""
+    shapes, leaves = named(like), dict(zip(layout.blocks, blocks, strict=True))
+    leaves |= {n: torch.from_numpy(x).view(shapes[n].shape) for n, x in layout.still.items()}
     leaves["state_step"] = torch.from_numpy(clock).view(like.state.step.shape)
     if whole is not None:
         leaves |= dict(zip(WHOLE, torch.from_numpy(whole).view(-1, *like.state.speed.shape), strict=False))
@@ -360,14 +337,12 @@ def _world(
 
 def _in_rows(action: Array | Tensor | None) -> Array | None:
     """Return an action as an array that loops read row after row."""
-    array = action.detach().numpy() if isinstance(action, Tensor) else action
-    return None if array is None else np.ascontiguousarray(array)
+    return None if action is None else torch.as_tensor(action).detach().contiguous().numpy()
 
 
 def _block(world: EnvState, names: Sequence[str]) -> Tensor:
     """Return what steps change of worlds as one tensor, with its graph."""
-    state = world.state
-    leaves = named(world)
+    state, leaves = world.state, named(world)
     return torch.stack([leaves[n].to(state.speed.dtype).expand(state.speed.shape) for n in names])
 
 

@@ -56,6 +56,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._rows = Rows(self.batch)
+        self._flat = (num_envs,)
         self._shape = (num_envs, agents * len(self.task.commands))
         self._ended = np.zeros(num_envs, dtype=bool)
 
@@ -142,7 +143,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
                 self._ended = np.zeros(self.num_envs, dtype=bool)
         self._watch(self.num_envs)
         if self._numpy:
-            reward = reward.astype(np.float64)
+            reward, terminated, truncated = reward.astype(np.float64), terminated.copy(), truncated.copy()
         return self._out(observation), reward, terminated, truncated, info
 
     def _final(self, observation: Any, outcome: Outcome) -> dict[str, Any]:
@@ -157,10 +158,6 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         for i in np.flatnonzero(ended):
             observations[i] = flat[i]
         return {"final_obs": observations, "_final_obs": ended, "final_info": last, "_final_info": ended.copy()}
-
-    def _out(self, observation: Any) -> Any:
-        flat = observation.reshape(self.num_envs, -1)
-        return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
 
     def render(self) -> Any:
         """Return pictures of every environment, as ``DiffIDMEnv.render``, or show the first one (``human``).

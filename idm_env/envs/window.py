@@ -215,7 +215,7 @@ class Tape:
         """Do all steps; episodes that end begin anew with the next action."""
         plan, held, done = self.plan, self.held, 0
         decides = {"seen": self.seen, "hidden": self.hidden, "later": self.hidden[1:]}
-        self.clocks[0] = values.clock().numpy()
+        self.clocks[0] = values.now.clock
         self.on_road[0] = batch.on_road().reshape(-1)
         while done < self.steps:
             ahead = min(batch.ahead()[0], 1 + plan.until(self.clocks[done] + 1))
@@ -227,9 +227,9 @@ class Tape:
             bound, decided, (_, normals) = plan.of(values.layout, batch.episode_params()), steps // held, batch.ahead()
             past, clock, now = values.past, self.clocks[done], done // held
             here = clock, self.action[now], self.on_road[now * held], normals, batch.used, past.numbers, past.newest
-            moment = Moment(*here, bound, values.whole, looks=(held - 1 - done) % held)
+            moment = Moment(*here, bound, values.now.whole, looks=(held - 1 - done) % held)
             self.held_memory += [normals, past.numbers]
-            pointers = plan.spread(moment, steps - done) | {"state_step": row_addresses(self.clocks, steps)}
+            pointers = plan.moving(moment, steps - done) | {"state_step": row_addresses(self.clocks, steps)}
             pointers |= {"live": row_addresses(self.on_road, decided * held)}
             pointers |= {"action": row_addresses(self.action, decided)}
             own: dict[str, Any] = {n: row_addresses(x, decided) for n, x in decides.items()}
@@ -237,7 +237,7 @@ class Tape:
             acts = _columns(self.driver.forward, own, len(steps))
             if done % held == 0 and plan.until(moment.clock) == 0:
                 self.driver.forward.run(0, plan.rows, address(acts))
-            worlds = plan.columns(moment, values.blocks, self.now[part], self.later[part])
+            worlds = plan.columns(moment, values.now, self.now[part], self.later[part])
             to = pointers | {n: row_addresses(x, steps) for n, x in self.outputs.items()}
             to |= {"clock": row_addresses(self.clocks[1:], steps), "on_road": row_addresses(self.on_road[1:], steps)}
             count = self._ahead(bound, acts, bound.ahead.filled(to, *worlds), part)
@@ -262,10 +262,10 @@ class Tape:
             action = done // self.held
             self.seen[action] = fresh.reshape(-1).numpy()  # type: ignore[union-attr]
             self.hidden[action].reshape(self.plan.rows, -1)[over] = 0.0
-            self.held_memory.append(values.blocks)
+            self.held_memory.append(values.now.blocks)
             if done < self.steps:
-                self.now[done] = values.blocks.data_ptr()
-            self.clocks[done] = values.clock().numpy()
+                self.now[done] = values.now.blocks.data_ptr()
+            self.clocks[done] = values.now.clock
             self.on_road[done] = batch.on_road().reshape(-1)
 
     def _ahead(self, bound: Tables, acts: Array, asks: Array, part: slice) -> int:
@@ -386,7 +386,7 @@ class _Window(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         seen, action = torch.from_numpy(tape.seen), torch.from_numpy(tape.action).view(actions, rows, -1)
         reward, last, hidden_last = map(torch.from_numpy, (tape.reward(), tape.last("observation"), tape.hidden[-1]))
-        after = values.blocks.clone(), None if token is None else token_like(token)
+        after = values.now.blocks.clone(), None if token is None else token_like(token)
         return (*after, seen.view(actions + 1, rows, -1), action, reward, last, hidden_last.view(hidden.shape))
 
     @staticmethod
@@ -430,7 +430,7 @@ def compiled(
     if driver is None:
         return None
     plan = values.plan((False, not batch.task.journeys), batch.task.simulator.draws, steps)
-    first = values.blocks
+    first = values.now.blocks
     begun = seen.new_zeros(len(seen), 0) if hidden is None else hidden
     bound = plan.of(values.layout, batch.episode_params())
     tape = Tape(plan, bound, driver, steps, first.detach(), seen.detach(), begun.detach(), push.detach())
@@ -443,7 +443,7 @@ def compiled(
     except BaseException:
         batch.back_to(mark)
         raise
-    values.arrive(out[0], values.clock().numpy(), out[1])
+    values.arrive(out[0], values.now.clock, out[1])
     batch.saw(out[2][-1])
     ends, cuts = (torch.from_numpy(tape.last(f"whole_{n}")[..., 0]) for n in ("terminated", "truncated"))
     return (out[2], out[3], out[4], ends, cuts, out[5], None if hidden is None else out[6])

@@ -6,7 +6,7 @@ Shapes: worlds are blocks ``[rows · vehicles]`` of every leaf; outputs have row
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from ctypes import addressof, c_char
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -38,6 +38,26 @@ class Layout(NamedTuple):
     version: int
 
 
+class Frame:
+    """Worlds at one moment, where they lie: blocks, the steps of all rows, and on several lanes whole numbers.
+
+    ``whole`` has shape ``(WHOLE, rows · vehicles)``; ``at`` and ``clock_at`` are where blocks and steps begin.
+    """
+
+    def __init__(self, blocks: Tensor, clock: Array, whole: Array | None = None) -> None:
+        self.blocks, self.clock, self.whole = blocks, clock, whole
+        self.at, self.clock_at = blocks.data_ptr(), address(clock)
+        self.views: tuple[Any, ...] = None, None, None
+        """Tensors that look at them, behind the layout and the whole numbers of which they were made."""
+
+    def take(self, other: Frame) -> None:
+        """Take over other worlds, where these lie."""
+        self.blocks.copy_(other.blocks.detach())
+        self.clock[:] = other.clock
+        if self.whole is not None:
+            self.whole[:] = other.whole
+
+
 @dataclass(slots=True)
 class Moment:
     """One step of a batch: all that its loops were given, so that its adjoint can be computed."""
@@ -54,6 +74,8 @@ class Moment:
     """Whole numbers ``(WHOLE, vehicles)`` before the step, on a road of several lanes."""
     crossing: Any = None
     """What became of them (``lane_transition.Crossing``)."""
+    spare: Array | None = None
+    """Where they are put, where memory stays."""
     looks: int = 0
     """After how many further steps somebody looks at what is seldom told, and again with every action."""
     given: dict[str, int] = field(default_factory=dict)
@@ -69,7 +91,7 @@ class RowTable:
         self._stays = loops.table(still)
         self._given = {n: loops.place(n) for n in (*loops.needs, *loops.outs) if n not in still}
         self._groups = [self._within(*group) for group in groups]
-        self._recent: dict[tuple[int, ...], tuple[Array, int]] = {}
+        self._laid: dict[Any, tuple[Array, int]] = {}
 
     def _within(self, prefix: str, names: Sequence[str], pitch: int) -> tuple[Array, Array]:
         places = {i: self._given.pop(prefix + n) for i, n in enumerate(names) if prefix + n in self._given}
@@ -85,18 +107,21 @@ class RowTable:
             cells[place] = given[name]
         return cells.T.copy() if several else cells
 
-    def pointer(self, given: Mapping[str, Any], begins: tuple[int, ...]) -> int:
-        """Return where the addresses for one call lie, until the next call: of recent worlds they are laid out."""
-        if begins not in self._recent:
-            if len(self._recent) > 1:
-                self._recent.clear()
-            cells = self.filled(given, *begins)
-            self._recent[begins] = cells, address(cells)
-            return self._recent[begins][1]
-        cells, pointer = self._recent[begins]
-        for name, place in self._given.items():
-            cells[place] = given[name]
-        return pointer
+    def laid(self, key: Any, lay: Callable[[], tuple[Any, ...]], moving: Mapping[str, Any]) -> tuple[Array, int]:
+        """Return the addresses for one call, or for some, and where they lie, until the next call.
+
+        ``lay`` returns what ``filled`` takes; a ``key`` is laid out once, and later only what is ``moving`` is put in.
+        """
+        if key not in self._laid:
+            if len(self._laid) >= 128:
+                self._laid.clear()
+            cells = self.filled(*lay())
+            self._laid[key] = cells, address(cells)
+        held = self._laid[key]
+        for name, x in moving.items():
+            if name in self._given:
+                held[0][..., self._given[name]] = x
+        return held
 
 
 class Room:

@@ -211,7 +211,7 @@ def test_nothing_is_stepped_by_torch_and_values_are_the_same_bits_without_a_grap
     np.testing.assert_array_equal(graph, plain)
     np.testing.assert_array_equal(graph, arrays)
     # In mid-window: copies go on alike, without the graph; cutting the graph frees it.
-    tape = weakref.ref(env.batch.values.blocks.grad_fn)
+    tape = weakref.ref(env.batch.values.now.blocks.grad_fn)
     others = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
     action = torch.zeros(3, 1)
     mine = env.step(action)

@@ -106,7 +106,7 @@ def test_no_task_asks_a_tensor_for_its_value(task):
     batch.world, batch.params, batch._draw = there(batch.world), there(batch.params), there(batch._draw)
     batch.values = batch._driven = None
     if batch.counters is not None:
-        batch.counters.stops = there(batch.counters.stops)
+        batch.counters.stops = there(torch.as_tensor(batch.counters.stops))
         batch.counters.begin(np.arange(0), batch.world.state)
     action = torch.zeros(2, env.action_space.shape[-1], device=META)
     batch.step(action)
