@@ -14,7 +14,7 @@ import copy
 import functools
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -24,7 +24,6 @@ from torch import Tensor
 from idm_env.compiled.kernels import dispatch
 from idm_env.compiled.scalar.record import Unordered, Untraceable
 from idm_env.envs.beginnings import Beginnings
-from idm_env.envs.counters import Counters
 from idm_env.envs.cuda_graph import Replayed
 from idm_env.envs.given import checked
 from idm_env.envs.moves import Moves
@@ -32,7 +31,6 @@ from idm_env.envs.recording import Recorder
 from idm_env.envs.settings import INFO, Settings
 from idm_env.jobs.storage import lacks_memory
 from idm_env.tasks import Draw, EnvState
-from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.types import Params, State, mapped, worthwhile
 from idm_env.validation import whole
 
@@ -45,8 +43,6 @@ _POOL_STREAM = 2
 _NORMALS_AT_ONCE = 1 << 14
 _WINDOW = 1 << 20
 """Most normals that are drawn ahead of steps one by one, and of a window."""
-_MARKED = ["_world", "_loaded", "_seen", "_there", "_draw", "_driven"]
-_MARKED += ["_block", "_drawn", "_drawn_steps", "used", "_pool"]
 
 
 class Whole(NamedTuple):
@@ -136,6 +132,27 @@ def in_memory(act: Act) -> Act:
     return cast(Act, call)
 
 
+@dataclass
+class Present:
+    """The present of a batch: all that its steps change, and ``back_to`` restores."""
+
+    world: EnvState | None = None
+    """The worlds, or None where ``Batch.values`` has them, that is where they are ``loaded``."""
+    loaded: bool = False
+    seen: Any = None
+    on_road: Any = None
+    """What is observed, and which agents are on the road, as the last step told it."""
+    draw: Draw | None = None
+    driven: Params | None = None
+    """Random numbers and parameters of these episodes."""
+    pool: EnvState | None = None
+    block: dict[str, Tensor] | None = None
+    drawn: dict[str, np.ndarray] = field(default_factory=dict)
+    drawn_steps: int = 0
+    used: int = 0
+    """Normals of ``drawn_steps`` steps, as tensors and as arrays, of which so many are ``used``."""
+
+
 class Batch:
     """``count`` environments that step together; row i draws what a single environment with its seed draws."""
 
@@ -147,30 +164,17 @@ class Batch:
         self.limit = settings.limit
         self.seeds = np.zeros(count, dtype=np.int64)
         self.episodes = np.full(count, -1, dtype=np.int64)
-        self._world: EnvState | None = None
+        self.now = Present()
         self._moves = Moves(settings)
         self._on_gpu = settings.device.type == "cuda"
         self.values: Values | None = self._compiled()
         """The worlds as compiled loops step them, None where torch does."""
         self._step = Replayed(self._stepped) if self._on_gpu else self._stepped
-        self._several = self.task.road.outline is not None
-        self._entered = self.task.journeys > 0
-        self._loaded = False
-        self._seen: Any = None
-        self._there: Any = None
         self._reasons: dict[int, str] = {}
-        self.counters: Counters | None = None
+        self.counters = self.task.counters(count, settings.device, settings.info)
         self.recording: Recorder | None = None
-        if isinstance(settings.task, OpenLanesTask) and (settings.task.loops or "stops" in settings.info):
-            self.counters = Counters(settings.task, count, settings.device)
-        self._draw: Draw | None = None
-        self._driven: Params | None = None
-        self._pool: EnvState | None = None
         self._beginnings = Beginnings(self._begin, count)
         self._beginner = settings.task
-        self._block: dict[str, Tensor] | None = None
-        self._drawn: dict[str, np.ndarray] = {}
-        self.used = self._drawn_steps = 0
         self._ahead = max(1, (_WINDOW if self._on_gpu else _NORMALS_AT_ONCE) // (count * self.task.vehicles))
 
     def _compiled(self) -> Values | None:
@@ -185,25 +189,25 @@ class Batch:
     @property
     def begun(self) -> bool:
         """Whether there was a reset."""
-        return self._loaded or self._world is not None
+        return self.now.loaded or self.now.world is not None
 
     @property
     def world(self) -> EnvState | None:
         """The worlds as they are now, or None before the first reset."""
-        if self._world is None and self._loaded and self.values is not None:
-            self._world = self.values.current()
-        return self._world
+        if self.now.world is None and self.now.loaded and self.values is not None:
+            self.now.world = self.values.current()
+        return self.now.world
 
     @world.setter
     def world(self, world: EnvState | None) -> None:
-        self._world, self._loaded, self._there = world, False, None
+        self.now.world, self.now.loaded, self.now.on_road = world, False, None
 
     def glance(self) -> EnvState:
         """Return the worlds as they are now, for reading only and until the next step."""
-        if self._world is None and self._loaded and self.values is not None:
+        if self.now.world is None and self.now.loaded and self.values is not None:
             return self.values.glance()
-        assert self._world is not None
-        return self._world
+        assert self.now.world is not None
+        return self.now.world
 
     # -- beginnings ----------------------------------------------------------------------------------------------
 
@@ -227,43 +231,41 @@ class Batch:
         if state is not None:
             state = self._given(state, draw)
         self.episodes[index] += 1
-        fresh, self._driven = self._beginnings.take(index, self.episodes), None
+        fresh, self.now.driven = self._beginnings.take(index, self.episodes), None
         if state is not None:
             fresh = fresh._replace(state=state)
         seen = self._took(index, fresh, draw, every)
-        if self.counters is not None:
-            self.counters.begin(index, self.glance().state)
-        if self.recording is not None:
-            self.recording.begin(index, self.glance().state)
+        for book in (self.counters, self.recording):
+            if book is not None:
+                book.begin(index, self.glance().state)
         return seen
 
     def _took(self, index: np.ndarray, fresh: EnvState, draw: Draw, every: bool) -> Tensor | np.ndarray:
         """Put new worlds into some rows, or all; return the observations of all of them."""
-        self._there = None
-        if every or not self.begun or self._draw is None:
-            self.world, self._draw = fresh, draw
-        elif self.values is not None and self._loaded and self._seen is not None:
+        self.now.on_road = None
+        if every or not self.begun or self.now.draw is None:
+            self.world, self.now.draw = fresh, draw
+        elif self.values is not None and self.now.loaded and self.now.seen is not None:
             self.values.replace(index, fresh)
-            self._draw = Draw(self._draw.key.index_put((torch.as_tensor(index),), draw.key))
-            self._world = self._block = None
+            self.now.draw = Draw(self.now.draw.key.index_put((torch.as_tensor(index),), draw.key))
+            self.now.world = self.now.block = None
             # Only these rows look anew.
             seen = self.task.observe(fresh)
-            if isinstance(self._seen, Tensor):
-                self._seen = self._seen.index_copy(0, torch.as_tensor(index), seen)
-                return self._seen.clone()
-            self._seen[index] = seen.detach().numpy()
-            return self._seen  # type: ignore[no-any-return]
+            if isinstance(self.now.seen, Tensor):
+                self.now.seen = self.now.seen.index_copy(0, torch.as_tensor(index), seen)
+                return self.now.seen.clone()
+            self.now.seen[index] = seen.detach().numpy()
+            return self.now.seen  # type: ignore[no-any-return]
         else:
             where = torch.as_tensor(index, device=self.settings.device)
             self.world = mapped(lambda old, new: old.index_put((where,), new), self.world, fresh)
-            self._draw = Draw(self._draw.key.index_put((where,), draw.key))
-        self._block = None
+            self.now.draw = Draw(self.now.draw.key.index_put((where,), draw.key))
+        self.now.block = None
         assert self.world is not None
         return self.task.observe(self.world).clone()
 
     def _draws(self, rows: np.ndarray, episodes: np.ndarray) -> Draw:
-        device = self.settings.device
-        return Draw.of(torch.as_tensor(self.seeds[rows], device=device), torch.as_tensor(episodes, device=device))
+        return Draw.of(*(torch.as_tensor(x, device=self.settings.device) for x in (self.seeds[rows], episodes)))
 
     def choose(self, choices: Mapping[str, Any]) -> None:
         """Begin episodes from now on with these of ``task.begins_with``; ValueError, nothing changed, for bad ones."""
@@ -271,7 +273,7 @@ class Batch:
             task = self._beginner
             others = {name: x for name, x in (task.randomise or {}).items() if name not in choices}
             self._beginner = replace(task, randomise=others or None, **choices)
-            self._pool = None
+            self.now.pool = None
             self._beginnings.forget()
 
     @torch.no_grad()
@@ -279,12 +281,12 @@ class Batch:
         draw = self._draws(rows, episodes)
         if not self.task.warmup_pool:
             return self._beginner.reset(draw, self.params)
-        if self._pool is None:
-            size, device = self.task.warmup_pool, self.settings.device
-            seeds = torch.arange(size, device=device) + _LARGEST_POOL * self.task.warmup_pool_seed
-            self._pool = self._beginner.reset(Draw.of(seeds, torch.full_like(seeds, -1)), self.params)
+        if self.now.pool is None:
+            seeds = torch.arange(self.task.warmup_pool, device=self.settings.device)
+            seeds = seeds + _LARGEST_POOL * self.task.warmup_pool_seed
+            self.now.pool = self._beginner.reset(Draw.of(seeds, torch.full_like(seeds, -1)), self.params)
         picked = (draw.uniforms(_POOL_STREAM, 1, torch.float64).squeeze(-1) * self.task.warmup_pool).long()
-        return mapped(lambda pooled: pooled[picked], self._pool)
+        return mapped(lambda pooled: pooled[picked], self.now.pool)
 
     @torch.no_grad()
     def _like(self, draw: Draw) -> State:
@@ -297,8 +299,8 @@ class Batch:
     def set_params(self, params: Params) -> None:
         """Replace the parameters (tensors, which may require grad); they hold from the next step on."""
         self.task.simulator.check(params)
-        self.params, self._driven = params, None
-        self._pool = None
+        self.params, self.now.driven = params, None
+        self.now.pool = None
         self._beginnings.forget()
 
     # -- steps ---------------------------------------------------------------------------------------------------
@@ -308,17 +310,17 @@ class Batch:
         if not self.task.simulator.draws:
             return None
         self._fill(clock, self._ahead)
-        self.used += 1
-        return self._block
+        self.now.used += 1
+        return self.now.block
 
     def _fill(self, clock: Callable[[], Tensor], steps: int) -> None:
         """See that normals of at least one step are drawn that were not used."""
-        if self._block is None or self.used >= self._drawn_steps:
-            assert self._draw is not None
-            self._block = self.task.normals(self._draw, clock(), steps, self.settings.dtype)
-            self.used, self._drawn_steps = 0, steps
+        if self.now.block is None or self.now.used >= self.now.drawn_steps:
+            assert self.now.draw is not None
+            self.now.block = self.task.normals(self.now.draw, clock(), steps, self.settings.dtype)
+            self.now.used, self.now.drawn_steps = 0, steps
             if self.values is not None:
-                self._drawn = {name: x.numpy().reshape(-1) for name, x in self._block.items()}
+                self.now.drawn = {name: x.numpy().reshape(-1) for name, x in self.now.block.items()}
 
     def ahead(self) -> tuple[int, dict[str, np.ndarray] | None]:
         """Return for how many steps normals are there, and these; ``used`` counts those that are gone."""
@@ -330,50 +332,49 @@ class Batch:
             lambda: torch.from_numpy(values.now.clock),
             max(self._ahead, min(64, _WINDOW // (self.count * self.task.vehicles)) or 1),
         )
-        return self._drawn_steps - self.used, self._drawn
+        return self.now.drawn_steps - self.now.used, self.now.drawn
 
     def episode_params(self) -> Params:
         """Return the parameters of steps in these episodes."""
-        if self._driven is None:
-            self._driven = self.task.episode_params(self.glance().episode, self.params)
-        return self._driven
+        if self.now.driven is None:
+            self.now.driven = self.task.episode_params(self.glance().episode, self.params)
+        return self.now.driven
 
     def seen(self) -> Tensor:
         """Return what is observed now, shape ``(n, agents · features)``, with its graph."""
-        if self._loaded and isinstance(self._seen, Tensor):
-            return self._seen.reshape(self.count, -1)
+        if self.now.loaded and isinstance(self.now.seen, Tensor):
+            return self.now.seen.reshape(self.count, -1)
         assert self.world is not None
         return self.task.observe(self.world).reshape(self.count, -1)
 
     def saw(self, seen: Tensor) -> None:
         """Note what is observed now, after steps that were done elsewhere."""
-        self._world, self._loaded, self._seen = None, True, seen.view(self.count, len(self.task.agents), -1)
-        self._there = None
+        self.now.world, self.now.loaded, self.now.seen = None, True, seen.view(self.count, len(self.task.agents), -1)
+        self.now.on_road = None
 
     def on_road(self) -> Tensor:
         """Return which agents' vehicles are on the road ``(n, agents)``."""
-        if self._there is not None:
-            return torch.as_tensor(self._there)
+        if self.now.on_road is not None:
+            return torch.as_tensor(self.now.on_road)
         every = torch.ones(self.count, len(self.task.agents), dtype=torch.bool, device=self.settings.device)
         return self.task.there(self.glance().state, every)
 
     def settle(self) -> None:
         """See that the present worlds lie where compiled loops step them."""
-        if self._world is not None and not self._loaded and self.values is not None:
-            self.values.load(self._world)
-            self.saw(self.task.observe(self._world))
+        if self.now.world is not None and not self.now.loaded and self.values is not None:
+            self.values.load(self.now.world)
+            self.saw(self.task.observe(self.now.world))
 
     def mark(self) -> tuple[Any, ...]:
         """Return what ``back_to`` goes back to."""
         assert self.values is not None
-        own = {n: self.__dict__[n] for n in _MARKED}
-        return {**own, "episodes": self.episodes.copy()}, self.values.mark()
+        return replace(self.now), self.episodes.copy(), self.values.mark()
 
     def back_to(self, mark: tuple[Any, ...]) -> None:
         """Undo steps, and resets within them."""
         assert self.values is not None
-        self.__dict__.update(mark[0])
-        self.values.back_to(mark[1])
+        self.now, self.episodes = replace(mark[0]), mark[1].copy()
+        self.values.back_to(mark[2])
         self._beginnings.forget()
 
     @in_memory
@@ -388,7 +389,7 @@ class Batch:
         end; until it is reset it drives on unseen. Whoever enters meanwhile is commanded from the next action on.
         """
         self._reasons = {}
-        if self._entered and action is not None:
+        if self.task.journeys > 0 and action is not None:
             on_road = self.on_road()
             live = on_road if live is None else live & on_road
         held = self.task.held
@@ -441,7 +442,7 @@ class Batch:
         before = self.world
         assert before is not None
         block = self._normals(lambda: before.state.step)
-        normals = None if block is None else {name: x[self.used - 1] for name, x in block.items()}
+        normals = None if block is None else {name: x[self.now.used - 1] for name, x in block.items()}
         step = self._stepped if self.task.simulator.untried else self._step
         driven = self.task.episode_params(before.episode, self.params)
         self.world, outputs = step(before, action, live, normals, driven, observed)
@@ -460,43 +461,43 @@ class Batch:
 
         Of several rewards are summed, and the rest is that of the last one.
         """
-        values, world = self.values, self._world
+        values, world = self.values, self.now.world
         assert values is not None
         if self.settings.output == "torch" and dispatch.surroundings() is not None:
-            self._world, self._loaded = self.world, False
+            self.now.world, self.now.loaded = self.world, False
             return None
-        used, block = self.used, self._block
+        used, block = self.now.used, self.now.block
         try:
-            if world is not None and not self._loaded:
+            if world is not None and not self.now.loaded:
                 values.load(world)
             who = None if live is None else live.numpy().reshape(-1)
             if steps > 1:
                 left, noise = self.ahead()
-                rows = values.hold(action, who, noise, self.used, self.episode_params(), steps, left)
+                rows = values.hold(action, who, noise, self.now.used, self.episode_params(), steps, left)
                 outputs, steps = _summed(*rows), rows[1]
-                self.used += steps
+                self.now.used += steps
             else:
-                noise = None if self._normals(lambda: torch.from_numpy(values.now.clock)) is None else self._drawn
-                outputs = values.step(action, who, noise, max(self.used - 1, 0), self.episode_params(), observed)
+                noise = None if self._normals(lambda: torch.from_numpy(values.now.clock)) is None else self.now.drawn
+                outputs = values.step(action, who, noise, max(self.now.used - 1, 0), self.episode_params(), observed)
         except Untraceable as why:
-            self._world, self._loaded = self.world, False
-            self.used, self._block = used, block
+            self.now.world, self.now.loaded = self.world, False
+            self.now.used, self.now.block = used, block
             if not isinstance(why, Unordered):
                 # Where an effect is why it was said before (``kernels.printed``); NaN the step itself tells.
-                if self.settings.output == "torch" or self._several:
+                if self.settings.output == "torch" or self.task.road.outline is not None:
                     warnings.warn(f"no compiled step, the torch path runs instead: {why}.", stacklevel=4)
                 self.values = None
             return None
         # What is told as a tensor is written to by whom it pleases.
-        seen, self._there = outputs["observation"], outputs.get("on_road")
-        self._world, self._loaded, self._seen = None, True, seen.clone() if isinstance(seen, Tensor) else seen
+        seen, self.now.on_road = outputs["observation"], outputs.get("on_road")
+        self.now.world, self.now.loaded, self.now.seen = None, True, seen.clone() if isinstance(seen, Tensor) else seen
         return outputs, steps
 
     def detach(self) -> None:
         """Cut the graph behind the present state, for truncated back-propagation."""
-        if isinstance(self._seen, Tensor):
-            self._seen = self._seen.detach()
-        if self._world is None and self._loaded and self.values is not None:
+        if isinstance(self.now.seen, Tensor):
+            self.now.seen = self.now.seen.detach()
+        if self.now.world is None and self.now.loaded and self.values is not None:
             self.values.detach()
             return
         if self.world is not None:
@@ -506,7 +507,11 @@ class Batch:
         """Leave out the graph: a copy, or what is pickled, goes on from the present worlds."""
         world = self.world
         cut = None if world is None else mapped(lambda x: x.detach(), world)
-        return {**self.__dict__, "_world": cut, "_loaded": False, "values": None, "_seen": None, "_driven": None}
+        return {
+            **self.__dict__,
+            "now": replace(self.now, world=cut, loaded=False, seen=None, driven=None),
+            "values": None,
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take over everything, with loops of its own."""

@@ -226,7 +226,7 @@ class Tape:
             steps = np.arange(part.start, part.stop, dtype=np.int64)
             bound, decided, (_, normals) = plan.of(values.layout, batch.episode_params()), steps // held, batch.ahead()
             past, clock, now = values.past, self.clocks[done], done // held
-            here = clock, self.action[now], self.on_road[now * held], normals, batch.used, past.numbers, past.newest
+            here = clock, self.action[now], self.on_road[now * held], normals, batch.now.used, past.numbers, past.newest
             moment = Moment(*here, bound, values.now.whole, looks=(held - 1 - done) % held)
             self.held_memory += [normals, past.numbers]
             pointers = plan.moving(moment, steps - done) | {"state_step": row_addresses(self.clocks, steps)}
@@ -242,7 +242,7 @@ class Tape:
             to |= {"clock": row_addresses(self.clocks[1:], steps), "on_road": row_addresses(self.on_road[1:], steps)}
             count = self._ahead(bound, acts, bound.ahead.filled(to, *worlds), part)
             self.segments.append(_Segment(done, done + count, moment, worlds[: len(plan.before)], pointers))
-            batch.used += count
+            batch.now.used += count
             values.past.newest -= count if values.past.slots else 0
             done += count
             whole = moment.crossing.later[count - 1] if moment.crossing else None

@@ -8,7 +8,7 @@ step. A crash ends an episode, and with it what was in store: see ``idm_env.task
 import abc
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from typing import Any, ClassVar
@@ -23,6 +23,7 @@ from idm_env.roads import Road
 from idm_env.simulator import Simulator, stacked
 from idm_env.tasks.behaviour import Behaviour, behaviour
 from idm_env.tasks.checks import Range, agents_of, in_ranges, limits_of, one_declared, ranges, ranges_of, two_ends
+from idm_env.tasks.counters import Counters
 from idm_env.tasks.crash import contact, lawful_cost
 from idm_env.tasks.failsafe import safe_accel
 from idm_env.tasks.features import FEATURES, AgentView, Feature, ObservedFeature, chosen
@@ -611,6 +612,10 @@ class Task(abc.ABC):
         """Return whose episodes end in a crash: those of all, where any two vehicles have touched (a gap ≤ 0)."""
         crashed = world.state.gap.amin(-1, keepdim=True) <= 0.0
         return crashed.expand(-1, len(self.agents)) if len(self.agents) > 1 else crashed
+
+    def counters(self, rows: int, device: torch.device, info: Collection[str]) -> Counters | None:
+        """Return the counters of stops and detectors for so many rows, None where there are none."""
+        return None
 
     def info(self, world: EnvState) -> dict[str, Tensor]:
         """Return what infos tell beyond what every task does (``idm_env.envs.info``), ``(environments, agents)``."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, ClassVar
@@ -18,6 +18,7 @@ from idm_env.multilane import demand
 from idm_env.roads import Lanes
 from idm_env.tasks.base import EnvState
 from idm_env.tasks.checks import FLOW, Range, entry
+from idm_env.tasks.counters import Counters
 from idm_env.tasks.features import FEATURES, AgentView, Feature, feature, part
 from idm_env.tasks.lanes import FASTEST, PACE, LanesTask
 from idm_env.tasks.random import Draw
@@ -378,6 +379,10 @@ class OpenLanesTask(LanesTask):
             Feature("next_end", "", "m", 100.0, 0.0, _SIGHT, partial(part, _next, 0)),
             Feature("next_left", "", "lanes", 1.0, -last, last, partial(part, _next, 1)),
         )
+
+    def counters(self, rows: int, device: torch.device, info: Collection[str]) -> Counters | None:
+        """Return the counters of stops and detectors, None where neither is asked for."""
+        return Counters(self.loops, self.simulator.dt, rows, device) if self.loops or "stops" in info else None
 
     def info(self, world: EnvState) -> dict[str, Tensor]:
         """As in ``LanesTask``, and of all traffic what became of trips, who stands and what is burnt, now or so far.

@@ -217,7 +217,7 @@ def test_several_lanes_are_compiled_from_the_first_step():
             ours = copy.deepcopy(ours)
         for told in zip(ours.step(action)[:4], theirs.step(action)[:4], strict=True):
             _same(*told)
-        assert ours.unwrapped.batch._loaded
+        assert ours.unwrapped.batch.now.loaded
 
 
 def test_what_several_lanes_do_not_compile_is_said_with_its_reason():

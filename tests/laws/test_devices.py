@@ -103,8 +103,8 @@ def test_no_task_asks_a_tensor_for_its_value(task):
     env.reset(seed=1)
     batch = env.batch
     batch.settings = batch._moves.settings = dataclasses.replace(batch.settings, device=META)
-    batch.world, batch.params, batch._draw = there(batch.world), there(batch.params), there(batch._draw)
-    batch.values = batch._driven = None
+    batch.world, batch.params, batch.now.draw = there(batch.world), there(batch.params), there(batch.now.draw)
+    batch.values = batch.now.driven = None
     if batch.counters is not None:
         batch.counters.stops = there(torch.as_tensor(batch.counters.stops))
         batch.counters.begin(np.arange(0), batch.world.state)

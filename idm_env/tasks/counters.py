@@ -8,14 +8,14 @@ time in which a vehicle was above it; all at every Δt. What a window does in on
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.tasks.open_lanes import OpenLanesTask
-from idm_env.tasks.said_roads import STANDS
+from idm_env.tasks.said_roads import STANDS, Loop
 from idm_env.types import State
 
 
@@ -44,8 +44,8 @@ class _Seen(NamedTuple):
 class Counters:
     """Stops ``(rows,)``, and a table for each row, of this episode."""
 
-    def __init__(self, task: OpenLanesTask, rows: int, device: torch.device) -> None:
-        self.loops, self._dt = task.loops, task.simulator.dt
+    def __init__(self, loops: Sequence[Loop], dt: float, rows: int, device: torch.device) -> None:
+        self.loops, self._dt = loops, dt
         self.stops: Any = _numbers(torch.zeros(rows, dtype=torch.int64, device=device))
         self.tables: list[list[dict[str, Any]]] = [[] for _ in range(rows)]
         self._sums = np.zeros((rows, len(self.loops), 3))
