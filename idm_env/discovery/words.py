@@ -378,7 +378,7 @@ def _of_drivers(drivers: Solution, law: str) -> list[tuple[float, str]]:
             null = p.null or 0.0
             low, middle, high = np.quantile(theta[:, i], [0.1, 0.5, 0.9])
             share = float(np.mean(theta[:, i] > null if middle > null else theta[:, i] < null))
-            text = ALL[name].wording[middle > null].replace("{law}", law) or plain(name)
+            text = ALL[name].wording[int(middle > null)].replace("{law}", law) or plain(name)
             values = f"{p.symbol} = {number(middle, 2)}, of 80 % of drivers {number(low, 2)} to {number(high, 2)}"
             strengths.append((share, f"{text[0].upper()}{text[1:]} ({values}; {law}: {number(null)})."))
     return strengths

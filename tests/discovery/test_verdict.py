@@ -26,7 +26,7 @@ from idm_env.discovery import (
     words,
     write_report,
 )
-from idm_env.discovery.bases import Law, best_of
+from idm_env.discovery.bases import Law, best_of, personal
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.compare import ERRORS, Comparison, ErrorChange
 from idm_env.discovery.judgement import Judgement
@@ -96,6 +96,18 @@ def test_a_law_is_better_where_an_error_is_lower_beyond_chance() -> None:
     assert told.startswith("Gipps' model predicts better than IDM calibrated alike: gap 5 s ahead −10.0")
     more = " ".join(words.law_details(gipps, on=False))
     assert f"with {len(gipps.law.declared)} parameters a driver" in more and "explain --base gipps" in more
+
+
+@pytest.mark.parametrize(("stiffness", "finding"), [(0.4, "less"), (2.5, "more")])
+def test_a_law_with_strengths_of_each_drivers_own_says_which_way_they_lie(stiffness: float, finding: str) -> None:
+    bare = Hypothesis((), Catalogue((), base_named("idm"), located=False))
+    model = personal(bare, base_named("idm"))
+    own = Law(base_named("idm"), model, None, errors(UP, BETTER, SAME))  # type: ignore[arg-type]
+    values = [stiffness if name == "gap_stiffness" else p.default for name, p in model.catalogue.of_driver]
+    theta = np.log(np.array(values)) + np.zeros((5, 1))
+    first = words.law_first(own, "IDM", SimpleNamespace(model=model, theta=theta, row_group=np.arange(5)))  # type: ignore[arg-type]
+    told = ALL["gap_stiffness"].wording[finding == "more"]
+    assert first.startswith(f"{told[:1].upper()}{told[1:]}"[:20]) and "With strengths of each driver's own" in first
 
 
 def test_a_choice_is_made_anew_without_every_fold() -> None:
