@@ -81,7 +81,7 @@ def tracks(found: Trajectories | Spool) -> dict[tuple[str, str], dict[float, tup
     if isinstance(found, Trajectories):
         table = found.table.with_columns(pl.col("leader_id").fill_null(""))
     else:
-        table = pl.concat([found.shelf.table(n).frame for n in range(found.chunks)])
+        table = pl.concat([found.shelf.table(n) for n in range(found.chunks)])
     names = ["run_id", "vehicle_id", "time_s", "position_m", "leader_id"]
     read: dict[tuple[str, str], dict[float, tuple[float, str, int | None]]] = {}
     for run_id, vehicle, time, position, leader in table.select(names).rows():

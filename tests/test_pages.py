@@ -131,7 +131,7 @@ def test_a_newcomer_finds_in_two_clicks_what_is_asked_most(site: Path) -> None:
         ("generated/effects.html", "speed-dependent gap"),
         ("architecture.html", "Add a task"),
         ("jobs/train.html", "train_apg.py"),
-        ("limits.html", "A GPU is for rollouts"),
+        ("limits.html", "A GPU pays from"),
         ("cards.html", "CITATION.cff"),
     ):
         assert place in near and words in (site / place).read_text(encoding="utf-8")

@@ -85,9 +85,8 @@ def parameter_rows(
         name = row["parameter"].rpartition(".")[2]
         own = values.setdefault(row["group"], {"source": "leader"})
         own |= {name: row["estimate"], f"{name}_error": row["standard_error"], f"{name}_identified": row["identified"]}
-    empty = {"source": "none", **{f"{p.name}_identified": False for p in IDM.declared}}
-    rows = []
-    for f in filtered:
-        names = {"run_id": f.track.run_id, "vehicle_id": f.track.vehicle_id, "piece": f.track.piece}
-        rows.append(names | values.get(f"{f.track.run_id}/{f.track.vehicle_id}", empty))
-    return rows
+    blank = {"": None, "_error": None, "_identified": False}
+    empty = {"source": "none", **{p.name + end: x for p in IDM.declared for end, x in blank.items()}}
+    tracks = [f.track for f in filtered]
+    names = [{"run_id": t.run_id, "vehicle_id": t.vehicle_id, "piece": t.piece} for t in tracks]
+    return [own | values.get(f"{t.run_id}/{t.vehicle_id}", empty) for own, t in zip(names, tracks, strict=True)]

@@ -13,7 +13,7 @@ from idm_env.data import DataError, Trajectories, load
 from idm_env.trajectories import spool
 from idm_env.trajectories.files import filter_file
 from tests.data.tables import kinds, platoon
-from tests.trajectories.tracks import read_frame
+from tests.trajectories.tracks import read_repaired
 
 
 def both_ways(signed: bool = True, lane: int | None = 5) -> pl.DataFrame:
@@ -78,8 +78,8 @@ def test_filter_mirrors_too_whatever_the_pieces(tmp_path: Path, monkeypatch: pyt
     table.write_parquet(path)
     monkeypatch.setattr(importlib.import_module("idm_env.data.load"), "BATCH_ROWS", 100)
     made = spool.Spool(path, tmp_path / "spool", 100)
-    whole = read_frame(table)
-    for found in (made.shelf.table(0).frame, whole.frame):
+    whole, repairs = read_repaired(table)
+    for found in (made.shelf.table(0), whole):
         assert {k: v - {""} for k, v in leaders(found).items()} == {
             "1": set(), "2": {"1"}, "3": {"2"}, "7": set(), "8": {"7"}, "9": {"8"},
         }  # fmt: skip
@@ -87,7 +87,7 @@ def test_filter_mirrors_too_whatever_the_pieces(tmp_path: Path, monkeypatch: pyt
             "position_m"
         ].all()
     assert made.vehicles == [("60", str(i)) for i in (1, 2, 3)] + [("60-reverse", str(i)) for i in (7, 8, 9)]
-    assert kinds(made.repairs)["direction mirrored"] == kinds(whole.repairs)["direction mirrored"] == 3
+    assert kinds(made.repairs)["direction mirrored"] == kinds(repairs)["direction mirrored"] == 3
 
 
 def test_filter_says_which_lengths_it_assumed(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def test_a_path_is_a_path(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
     Path(name).parent.mkdir(exist_ok=True)
     path = write(platoon(vehicles=5), Path(name))
     assert load(path).table["vehicle_id"].n_unique() == 5
-    assert Spool(path, Path("[spool]*"), 2).shelf.table(2).frame["vehicle_id"].unique().to_list() == ["5"]
+    assert Spool(path, Path("[spool]*"), 2).shelf.table(2)["vehicle_id"].unique().to_list() == ["5"]
     if path.parent != Path():
         (share,) = folder.shares(path.parent, 100)
         assert share.vehicles == 5 and share.trajectories().table["vehicle_id"].n_unique() == 5
