@@ -282,6 +282,8 @@ class _Nested:
             moved = (own[0] != self.at[0][0]).any(-1).numpy()[self.problem.rows.group]
         key = moved.tobytes()
         if key not in self.parts:
+            if len(self.parts) >= 8:  # each is a copy of rows, and groups that are done change slowly
+                self.parts.clear()
             self.parts[key] = self.problem if moved.all() else self.problem.of_rows(moved)
         return self.parts[key], moved
 

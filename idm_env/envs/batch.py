@@ -242,13 +242,12 @@ class Batch:
 
     def _took(self, index: np.ndarray, fresh: EnvState, draw: Draw, every: bool) -> Tensor | np.ndarray:
         """Put new worlds into some rows, or all; return the observations of all of them."""
-        self.now.on_road = None
         if every or not self.begun or self.now.draw is None:
             self.world, self.now.draw = fresh, draw
         elif self.values is not None and self.now.loaded and self.now.seen is not None:
             self.values.replace(index, fresh)
             self.now.draw = Draw(self.now.draw.key.index_put((torch.as_tensor(index),), draw.key))
-            self.now.world = self.now.block = None
+            self.now.world = self.now.block = self.now.on_road = None
             # Only these rows look anew.
             seen = self.task.observe(fresh)
             if isinstance(self.now.seen, Tensor):
@@ -322,16 +321,16 @@ class Batch:
             if self.values is not None:
                 self.now.drawn = {name: x.numpy().reshape(-1) for name, x in self.now.block.items()}
 
+    def _clock(self) -> Tensor:
+        """Return the steps of all rows, where compiled loops have them."""
+        assert self.values is not None
+        return torch.from_numpy(self.values.now.clock)
+
     def ahead(self) -> tuple[int, dict[str, np.ndarray] | None]:
         """Return for how many steps normals are there, and these; ``used`` counts those that are gone."""
-        values = self.values
-        assert values is not None
         if not self.task.simulator.draws:
             return 64, None
-        self._fill(
-            lambda: torch.from_numpy(values.now.clock),
-            max(self._ahead, min(64, _WINDOW // (self.count * self.task.vehicles)) or 1),
-        )
+        self._fill(self._clock, max(self._ahead, min(64, _WINDOW // (self.count * self.task.vehicles)) or 1))
         return self.now.drawn_steps - self.now.used, self.now.drawn
 
     def episode_params(self) -> Params:
@@ -477,7 +476,7 @@ class Batch:
                 outputs, steps = _summed(*rows), rows[1]
                 self.now.used += steps
             else:
-                noise = None if self._normals(lambda: torch.from_numpy(values.now.clock)) is None else self.now.drawn
+                noise = None if self._normals(self._clock) is None else self.now.drawn
                 outputs = values.step(action, who, noise, max(self.now.used - 1, 0), self.episode_params(), observed)
         except Untraceable as why:
             self.now.world, self.now.loaded = self.world, False
