@@ -29,7 +29,7 @@ demo: $(VENV)/.data
 FACES := $(addprefix tests/envs/test_,gym.py pettingzoo.py sb3.py render.py limits.py fitting_wrapper.py)
 LITTLE := tests/agents tests/tasks $(addprefix tests/envs/test_,recording.py unroll.py step_gradients.py) $(FACES) \
   tests/laws/test_printed.py tests/kernels/test_policy_rows.py \
-  $(filter-out tests/test_docs.py tests/test_faults.py,$(wildcard tests/test_*.py))
+  $(filter-out $(addprefix tests/test_,cli.py docs.py docs_commands.py examples.py faults.py),$(wildcard tests/test_*.py))
 TEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST)
 test: test-much test-little
 
