@@ -11,8 +11,8 @@ from typing import Any
 DT, VEHICLES = 0.1, 22
 
 
-def window(count: int, steps: int) -> Callable[[], object] | None:
-    """Return a call that drives a window of so many rings forward and backward; None where JAX is not installed."""
+def window(count: int, steps: int, forward: bool = False) -> Callable[[], object] | None:
+    """Return a call that drives a window of so many rings, ``forward`` or also back; None where JAX is not installed."""
     if not find_spec("jax"):
         return None
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
@@ -46,5 +46,5 @@ def window(count: int, steps: int) -> Callable[[], object] | None:
         policy.append((jax.random.normal(own, (wide, tall)) / wide**0.5, np.zeros(tall)))
     shape = (count, VEHICLES)
     start = (np.zeros(shape), np.full(shape, 4.0), np.full(shape, 6.0))
-    normals, compiled = jax.random.normal(key, (steps, *shape)), jax.jit(jax.value_and_grad(loss))
+    normals, compiled = jax.random.normal(key, (steps, *shape)), jax.jit(loss if forward else jax.value_and_grad(loss))
     return lambda: jax.block_until_ready(compiled(policy, start, normals))

@@ -64,13 +64,12 @@ def action_of(action: Any, shape: tuple[int, ...], made: Settings) -> Tensor | n
         raise ValueError(f"action has shape {tuple(x.shape)}; {shape} is needed: one number per controlled vehicle.")
     held = x.detach() if isinstance(x, Tensor) else x
     finite = torch.isfinite if isinstance(x, Tensor) else np.isfinite
-    if not (math.isfinite(held.item()) if math.prod(shape) == 1 else finite(held).all()):
+    if not (math.isfinite(held.item()) if shape == (1,) else finite(held).all()):
         raise ValueError("action holds NaN or infinite values. Give finite numbers; those outside [-1, 1] are clipped.")
-    kind = numpy_dtype(made.dtype)
-    if x.dtype.itemsize > np.dtype(kind).itemsize:  # what is finite stays so
+    if x.dtype.itemsize > made.dtype.itemsize:  # what is finite stays so
         x = x.clip(-1.0, 1.0)
     if isinstance(x, np.ndarray):
-        x = x.astype(kind, order="C")
+        x = x.astype(numpy_dtype(made.dtype), order="C")
         return x if made.output == "numpy" else torch.from_numpy(x).to(made.device)
     x = x.to(device=made.device, dtype=made.dtype)
     return x.detach().cpu().numpy() if made.output == "numpy" else x  # type: ignore[no-any-return]
