@@ -38,8 +38,3 @@ def curve(p, number, tables, x):
     low = min(int(position), count - 2)
     share = position - low
     return (1.0 - share) * p[first + 4 + low] + share * p[first + 5 + low]
-
-
-def value_of_curve(p, number, tables, x):
-    """Return ``curve``; numba compiles plain functions into what is staged."""
-    return curve(p, number, tables, x)

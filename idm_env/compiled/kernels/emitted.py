@@ -12,6 +12,7 @@ import builtins
 import operator
 import re
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,6 +81,7 @@ class Walk:
         self._read: list[tuple[str, Variable]] = []
         self._scopes: dict[str, Any] = {}
         self._accesses: list[tuple[Any, str]] = []
+        self.returned: list[Any] = []
 
     def run(self, function: ast.FunctionDef, arguments: Sequence[tuple[Any, Any]]) -> None:
         """Emit a function whose arguments have these types and values."""
@@ -107,6 +109,10 @@ class Walk:
 
     def _pass(self, node: ast.Pass) -> None:
         """Nothing."""
+
+    def _return(self, node: ast.Return) -> None:
+        assert isinstance(node.value, ast.Tuple)
+        self.returned = [self._number(self._value(x)).ir for x in node.value.elts]
 
     def _assign(self, node: ast.Assign) -> None:
         (target,) = node.targets
@@ -222,7 +228,14 @@ class Walk:
             self._accesses.append((access, name))
 
     def _place(self, node: ast.Subscript) -> Pointer:
-        array, index = self._value(node.value), self._cast(self._value(node.slice), types.int64)
+        array, cell = self._value(node.value), node.slice
+        *rows, index = (self._cast(self._value(x), types.int64) for x in getattr(cell, "elts", [cell]))
+        if isinstance(array, Value):
+            held = self._context.make_array(array.kind)(self._context, self._builder, array.ir)
+            for row in rows:
+                wide = cgutils.unpack_tuple(self._builder, held.shape, 2)[1]
+                index = self._builder.add(self._builder.mul(row, wide), index)
+            array = Pointer(array.kind.dtype, held.data)
         return Pointer(array.kind, self._builder.gep(array.ir, [index]), array.name)
 
     def _binop(self, node: ast.BinOp) -> Any:
@@ -257,6 +270,8 @@ class Walk:
             self._names = before
             return result
         called, arguments = self._value(node.func), [self._value(x) for x in node.args]
+        if called is choose:
+            return self._chosen(*arguments)
         if called is carray:
             return arguments[0]
         if called is located:
@@ -270,6 +285,18 @@ class Walk:
         if isinstance(called, type) and issubclass(called, np.generic):
             return Value(_type_of(called), self._cast(arguments[0], _type_of(called)))
         return self._called(called, arguments)
+
+    def _chosen(self, test: Any, one: Any, other: Any) -> Any:
+        if not isinstance(test, Value):
+            return one if test else other
+        builder, (one, other) = self._builder, map(self._number, (one, other))
+        before = builder.block
+        with builder.if_then(self._cast(test, types.boolean)):
+            inside = builder.block
+        result = builder.phi(one.ir.type)
+        result.add_incoming(one.ir, inside)
+        result.add_incoming(other.ir, before)
+        return Value(one.kind, result)
 
     def _called(self, function: Any, arguments: Sequence[Any]) -> Any:
         """Return what a function makes of numbers: numba's instructions for their types."""
@@ -324,24 +351,56 @@ def _type_of(kind: Any) -> Any:
     return from_dtype(np.dtype(kind))
 
 
+def choose(test: Any, one: Any, other: Any) -> Any:
+    """In printed text: one where a test holds, else the other; both are there already, of one type.
+
+    A branch, not a selection: what follows need not wait for the one that does not count.
+    """
+
+
+def inlined(results: int = 0) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator of printed functions that loops of their file call; they return so many doubles, in a tuple.
+
+    Arrays lie in one piece, of one dimension or two.
+    """
+    returned = types.UniTuple(types.float64, results) if results else types.void
+
+    def wrapped(function: Callable[..., Any]) -> Any:
+        return counted(function.__name__, ", ".join(_names(function)), _typed(function, returned))
+
+    return wrapped
+
+
+@lru_cache(maxsize=32)
+def _functions(module: str) -> dict[str, ast.FunctionDef]:
+    return {x.name: x for x in ast.parse(module_text(module)).body if isinstance(x, ast.FunctionDef)}
+
+
+def _names(function: Callable[..., Any]) -> tuple[str, ...]:
+    return function.__code__.co_varnames[: function.__code__.co_argcount]
+
+
+def _typed(function: Callable[..., Any], returned: Any) -> Callable[..., Any]:
+    """Return what gets the types of arguments of a printed function, and returns its signature and who emits it."""
+
+    def typed(*given: Any) -> Any:
+        def generate(context: Any, builder: Any, made: Any, arguments: Any) -> Any:
+            walk = Walk(context, builder, function.__globals__)
+            walk.run(_functions(function.__module__)[function.__name__], list(zip(made.args, arguments, strict=True)))
+            return context.make_tuple(builder, returned, walk.returned) if walk.returned else context.get_dummy_value()
+
+        return signature(returned, *given), generate
+
+    return typed
+
+
 def emitted(kind: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator of printed functions to be called by their ``address``; their machine code is kept."""
 
     def compiled(function: Callable[..., Any]) -> Any:
-        names = function.__code__.co_varnames[: function.__code__.co_argcount]
-
-        def typed(*given: Any) -> Any:
-            def generate(context: Any, builder: Any, made: Any, arguments: Any) -> Any:
-                tree = ast.parse(module_text(function.__module__))
-                body = next(x for x in tree.body if isinstance(x, ast.FunctionDef) and x.name == function.__name__)
-                walk = Walk(context, builder, function.__globals__)
-                walk.run(body, list(zip(made.args, arguments, strict=True)))
-                return context.get_dummy_value()
-
-            return signature(types.void, *given), generate
-
-        parameters = ", ".join(names)
-        room: dict[str, Any] = {"body": counted("body", parameters, typed), "__name__": function.__module__}
+        parameters = ", ".join(_names(function))
+        body = counted("body", parameters, _typed(function, types.void))
+        room: dict[str, Any] = {"body": body, "__name__": function.__module__}
         exec(f"def {function.__name__}({parameters}):\n    body({parameters})", room)
         chosen = {"error_model": "numpy"} | options
         return compat.compiled_callback(room[function.__name__], kind, chosen, name_of(function, chosen), STORE)

@@ -1,6 +1,6 @@
 """Loop over rows and time of discovery's rollout, without an equation: lines between marks are printed.
 
-This file is a template (``march``). What is printed is staged: Python runs it once, when numba compiles the loop.
+This file is a template (``march``). What is printed is walked once (``kernels.emitted``), when numba compiles the loop.
 """
 
 # ruff: noqa: F401, F821
@@ -10,38 +10,23 @@ from __future__ import annotations
 import numpy as np
 
 from idm_env.compiled.kernels.compiler import compiler
-from idm_env.compiled.kernels.curves import value_of_curve
-from idm_env.compiled.kernels.staged import (
-    Merged,
-    choose,
-    cos,
-    exp,
-    expm1,
-    floor,
-    log,
-    log1p,
-    looked_up,
-    negated,
-    sigmoid,
-    sin,
-    sqrt,
-    staged,
-    tanh,
-    when,
-)
+from idm_env.compiled.kernels.curves import curve
+from idm_env.compiled.kernels.emitted import choose, inlined
+from idm_env.compiled.kernels.functions import exp_float64 as exp, sigmoid_float64 as sigmoid
 
+log1p, tanh = np.log1p, np.tanh
 ROOM = 68
 compiled = compiler()
 
 
-@staged()
+@inlined()
 def constants(p, th, k, c, flags):
     """Fill ``c`` with what depends on parameters alone."""
     # <constants>
     # </constants>
 
 
-@staged()
+@inlined()
 def sense(
     signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
     lead_accel, time, per_dt, place, pulse_now,
@@ -51,7 +36,7 @@ def sense(
     # </sense>
 
 
-@staged()
+@inlined()
 def beginning(
     signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
     lead_accel, time, per_dt, place, pulse_now,
@@ -61,7 +46,7 @@ def beginning(
     # </beginning>
 
 
-@staged()
+@inlined()
 def wind(
     signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
     lead_accel, time, per_dt, place, pulse_now,
@@ -71,7 +56,7 @@ def wind(
     # </wind>
 
 
-@staged(3)
+@inlined(3)
 def respond(
     signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
     lead_accel, time, per_dt, place, pulse_now,

@@ -1,4 +1,4 @@
-"""A graph with regions printed as straight-line Python for a loop over one vehicle, to be ``staged`` (``kernels``).
+"""A graph with regions printed as straight-line Python for a loop over one vehicle (``kernels.emitted.inlined``).
 
 What depends on parameters alone is printed apart (``constants``), into an array ``c``, before the loop over time.
 """
@@ -14,10 +14,8 @@ from idm_env.compiled.scalar.source import _FORMS, Constants
 _STAGED = {**_FORMS, "relu": "choose({0} < 0.0, 0.0, {0})", "clamp_min": "choose({0} < {1}, {1}, {0})"}
 _STAGED |= {"clamp_max": "choose({0} > {1}, {1}, {0})", "maximum": "choose({0} > {1}, {0}, {1})"}
 _STAGED |= {"minimum": "choose({0} < {1}, {0}, {1})", "select": "choose({0}, {1}, {2})"}
-_STAGED |= {"sign": "choose({0} > 0.0, 1.0, choose({0} < 0.0, -1.0, 0.0))", "and": "{0} & {1}", "or": "{0} | {1}"}
-_STAGED |= {"not": "negated({0})"}
-_STAGED |= {**{name: f"{name}({{0}})" for name in ("sqrt", "expm1", "log", "log1p", "tanh", "sin", "cos", "floor")}}
-"""Operation → text for ``kernels.staged``: functions where Python itself would ask for truth."""
+_STAGED |= {"sign": "choose({0} > 0.0, 1.0, choose({0} < 0.0, -1.0, 0.0))"}
+"""Operation → text for ``kernels.emitted``: choices are branches there."""
 
 Read = Callable[[Leaf], str]
 """How an input is read: an expression."""
@@ -86,11 +84,10 @@ class Straight:
                 for m in merges[region]:
                     outside, within = (self._name(m.args[k], names) for k in (2, 1))
                     names[m] = name = (fixed or {}).get(m, f"t{graph.serial[m]}")
-                    constant = name.startswith("c[")
-                    lines.append(f"{name} = {outside}" if constant else f"{name} = Merged({outside})")
-                    block = [*block, f"{name} = {within}" if constant else f"{name}.become({within})"]
+                    lines.append(f"{name} = {outside}")
+                    block = [*block, f"{name} = {within}"]
                 guard = self._name(node.args[0], names)
-                lines += [f"with when({guard}):  # {block_note(node)}", *(f"    {x}" for x in block)]
+                lines += [f"if {guard}:  # {block_note(node)}", *(f"    {x}" for x in block)]
                 continue
             if node.op in ("constant", "input") or node.boolean:
                 continue
@@ -104,7 +101,7 @@ class Straight:
         # Of a region that only fixes constants nothing is merged.
         for region, block in inside.items():
             if region not in done:
-                lines += [f"with when({self._name(graph.guards[region], names)}):", *(f"    {x}" for x in block)]
+                lines += [f"if {self._name(graph.guards[region], names)}:", *(f"    {x}" for x in block)]
         return lines
 
     def _name(self, node: Node, names: dict[Node, str]) -> str:
@@ -124,9 +121,9 @@ class Straight:
     def _text(self, node: Node, names: dict[Node, str]) -> str:
         arguments = [self._name(a, names) for a in node.args]
         if node.op == "past":
-            return f"h[now.before({arguments[0]}), {node.label}]"
+            return f"h[larger(now - np.int64({arguments[0]}), 0), {node.label}]"
         if node.op == "table":
-            return f"looked_up(value_of_curve, p, {node.label}, tables, {arguments[0]})"
+            return f"curve(p, {node.label}, tables, {arguments[0]})"
         return _STAGED[node.op].format(*arguments)
 
 
