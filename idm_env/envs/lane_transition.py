@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from idm_env.compiled.kernels import lane_change_loops
-from idm_env.compiled.kernels.lane_changes import Deciding, decision, rows_of
+from idm_env.compiled.kernels.lane_changes import KINDS, Deciding, decision, looked_at, rows_of, side_of
 from idm_env.compiled.kernels.lanes import static_of
 from idm_env.compiled.kernels.operands import operand
 from idm_env.compiled.kernels.rows import RowFunction, adjoint, storage
-from idm_env.compiled.scalar.record import Form, Unordered, Untraceable, slot_name
+from idm_env.compiled.scalar.record import Form, Unordered, Untraceable
 from idm_env.delay_buffer import PAST
 from idm_env.envs.moves import Moves
 from idm_env.envs.transition import CompiledTransition, Tables, WholeStep
@@ -108,33 +108,38 @@ class Stage:
         return before, more
 
 
-class Commands:
-    """What a step is given beside its worlds, as drivers see it who think of changing lanes."""
+class Looks:
+    """What drivers look at who think of changing lanes, as rows of their wishes: as loops over worlds, by number.
 
-    def __init__(self, step: WholeStep, moves: Moves, world: EnvState) -> None:
-        normals = {n.removeprefix("normal_"): x for n, x in step.inputs.items() if n.startswith("normal_")}
-        self.inputs: dict[str, Any] = {}
-        self.normals: dict[str, str] = {}
+    They see worlds after some have come and gone, and what agents have commanded in those before. ``wishes`` is None
+    where nobody changes lanes.
+    """
 
-        def inputs_of(**leaves: Tensor) -> dict[str, Tensor]:
-            _, _, inputs = moves.commanded(
-                world_of(leaves, world), leaves.get("action"), normals or None, leaves.get("live")
-            )
-            self.inputs.update(inputs)
-            out = {}
-            for effect, value in inputs.items():
-                for part, x in ({"": value} if isinstance(value, Tensor) else value._asdict()).items():
-                    if x is not None and x is normals.get(effect):
-                        self.normals[slot_name(effect, part)] = f"normal_{effect}"
-                    elif x is not None:
-                        wide = x.shape[-1] if x.dim() else 1
-                        out[slot_name(effect, part).replace(" ", "_")] = x.expand(step.many, wide)
+    def __init__(self, step: WholeStep, plan: LaneTransition) -> None:
+        simulator, like, moves = plan.task.simulator, plan.world, plan.moves
+
+        def inputs_of(**leaves: Tensor) -> Any:
+            normals = {n.removeprefix("normal_"): x for n, x in leaves.items() if n.startswith("normal_")}
+            return moves.commanded(world_of(leaves, like), leaves.get("action"), normals or None, leaves.get("live"))[2]
+
+        def looked(**leaves: Tensor) -> dict[str, Tensor]:
+            state = world_of({**leaves, **{n: leaves[f"mid_{n}"] for n in step.changing}}, like).state
+            out, inputs = dict[str, Tensor](), inputs_of(**leaves)
+            for name in self.names:
+                x = looked_at(simulator, state, inputs, {}, name).to(state.speed.dtype)
+                out[name.replace(" ", "_")] = x.expand(step.many, x.shape[-1] if x.dim() else 1)
             return out
 
-        examples = {n: x for n, x in step.inputs.items() if n in step.sample or n in ("action", "live")}
-        self.loops = RowFunction(inputs_of, examples, step.many)
-        rows = len(world.state.speed)
-        self.arrays = Room({n: (rows, *shape) for n, shape in self.loops.shapes.items()}, self.loops.types).arrays
+        with torch.no_grad():
+            form = Form.of(like.state._replace(lanes=None), inputs_of(**step.inputs))
+        self.wishes: Any = decision(simulator, form) if simulator.lane_change_models else None
+        if isinstance(self.wishes, str):
+            raise Untraceable(self.wishes)
+        slots = () if self.wishes is None else self.wishes.slots
+        self.names = {name: None for slot in slots if (name := side_of(slot)[1]) not in KINDS and "." not in name}
+        self.loops = RowFunction(looked, step.inputs, step.many)
+        shapes = {n: (plan.rows, *shape) for n, shape in self.loops.shapes.items()}
+        self.arrays = Room(shapes, self.loops.types).arrays
 
 
 class LaneTables(Tables):
@@ -144,57 +149,22 @@ class LaneTables(Tables):
 
     def __init__(self, plan: LaneTransition, layout: Layout, params: Params) -> None:
         super().__init__(plan, layout, params)
-        self._arrays: list[Array] = []
         self.by_record = any(n.startswith("then_links") for n in self.recorded.forward.outs)
         """Whether a step itself writes who leads whom."""
-        self.clock = np.empty(plan.rows, plan.real)
-        self.ask = RowTable(plan.commands.loops, layout.still | plan.commands.arrays, plan.groups(""))
-        self.decides: Any = None if plan.wishes is None else self._decision(plan.wishes)
+        looks, self._arrays = plan.looks, list[Array]()
+        self.ask = RowTable(looks.loops, layout.still | looks.arrays, plan.before)
+        self.decides: Any = None if looks.wishes is None else rows_of(looks.wishes.slots, self._find)
+        """The rows of wishes: where their numbers lie, and whose they are."""
 
-    def _decision(self, wishes: Any) -> Any:
-        """Return the operands of the lane-change decision: rows, blocks, inputs, leader masks and compiled phase.
-
-        Untraceable for wishes that look at what no plan has.
-        """
-        plan, blocks, inputs = self.plan, list[tuple[int, int]](), list[tuple[int, str]]()
-        marks = {n: np.ones(1 if plan.ring else plan.count, plan.real) for n in ("led", "leads")}
-
-        def find(i: int, name: str) -> tuple[int, int, int]:
-            by_mark = (0, 0, 0) if plan.ring else (0, plan.size, 1)
-            source, by = (marks[name], by_mark) if name in marks else self._source(name)
-            if isinstance(source, str):
-                inputs.append((i, source))
-                return 0, *by[1:]
-            if isinstance(source, int):
-                blocks.append((i, source * plan.pitch))
-                return 0, *by[1:]
-            self._arrays.append(source)
-            return address(source), *by[1:]
-
-        rows, places = rows_of(wishes.slots, find)
-        which, offsets = np.array(blocks, np.int64).reshape(-1, 2).T
-        return rows, places, which, offsets, inputs, marks
-
-    def _source(self, name: str) -> tuple[Array | str | int, tuple[int, int, int]]:
-        """Return an array, the name of what is given with every step, or the number of a block; and its strides."""
-        plan, loops, by_vehicle = self.plan, self.plan.commands.loops, (0, self.plan.size, 1)
-        own = name.replace(" ", "_")
-        block = f"memory_{name.removeprefix('memory of ')}" if name.startswith("memory of ") else f"state_{name}"
-        if block in self.layout.blocks:
-            return self.layout.blocks.index(block), by_vehicle
-        if name == "step":
-            return self.clock, (0, 1, 0)
-        if block in self.layout.still:
-            return self.layout.still[block], by_vehicle
-        if not name.endswith(" now"):
-            x = static_of(plan.task.simulator, plan.world.state, self.params, name)
-            return operand(x.to(plan.world.state.speed.dtype), (plan.rows,), plan.size)
-        if name in plan.commands.normals:
-            return plan.commands.normals[name], by_vehicle
-        if loops.types[own] != plan.real:
-            raise Untraceable(f"drivers who change lanes look at {name.removesuffix(' now')}")
-        wide = loops.shapes[own][0]
-        return own, (0, wide, 0 if wide < plan.size else 1)
+    def _find(self, i: int, name: str) -> tuple[int, int, int]:
+        """Return where the numbers of a row of wishes lie, and their strides by row and vehicle."""
+        plan, array = self.plan, self.plan.looks.arrays.get(name.replace(" ", "_"))
+        if array is not None:
+            return address(array), array.shape[-1], int(array.shape[-1] == plan.size)
+        x = static_of(plan.task.simulator, plan.world.state, self.params, name).to(plan.world.state.speed.dtype)
+        array, (_, *by) = operand(x, (plan.rows,), plan.size)
+        self._arrays.append(array)
+        return address(array), *by  # type: ignore[return-value]
 
 
 class LaneTransition(CompiledTransition):
@@ -234,18 +204,9 @@ class LaneTransition(CompiledTransition):
         return LaneTables(self, layout, params)
 
     @cached_property
-    def commands(self) -> Commands:
-        """The inputs of a step as drivers see them who think of changing lanes."""
-        return Commands(next(iter(self._recorded.values())), self.moves, self.world)
-
-    @cached_property
-    def wishes(self) -> Any:
-        """The compiled decision, None where nobody changes lanes. Untraceable where it cannot be recorded."""
-        form = Form.of(self.world.state._replace(lanes=None), self.commands.inputs)
-        wishes = decision(self.task.simulator, form) if self.task.simulator.lane_change_models else None
-        if isinstance(wishes, str):
-            raise Untraceable(wishes)
-        return wishes
+    def looks(self) -> Looks:
+        """What drivers look at who think of changing lanes. Untraceable where it, or a wish, cannot be recorded."""
+        return Looks(next(iter(self._recorded.values())), self)
 
     @cached_property
     def settle(self) -> Stage:
@@ -311,7 +272,7 @@ class LaneTransition(CompiledTransition):
         phase = moment.clock % self._every
         if bound.recorded in self._turns:
             lanes.turned = np.flatnonzero(phase == 0)
-        if self.wishes is not None:
+        if self.looks.wishes is not None:
             lanes.decided = np.flatnonzero(np.isin(phase, self._stages) if len(self._stages) > 1 else phase == 0)
         begins = after = now.at, address(whole)
         if len(lanes.turned) or len(lanes.decided):
@@ -323,7 +284,7 @@ class LaneTransition(CompiledTransition):
             if len(lanes.turned):
                 self._turns[bound.recorded].run(bound.still, lanes.turned, step, *begins, *after)
             if len(lanes.decided):
-                self._decide(moment, bound, phase[lanes.decided], begins)
+                self._decide(moment, bound, phase[lanes.decided], begins + after)
                 self.settle.run(bound.still, lanes.decided, self._decision_inputs(moment), *after, *after)
         lanes.later = [lanes.whole_mid.copy() if bound.by_record else lanes.whole_mid]
         return begins + after
@@ -336,20 +297,12 @@ class LaneTransition(CompiledTransition):
     def _decide(self, moment: Moment, bound: LaneTables, stages: Array, begins: tuple[int, ...]) -> None:
         """Let vehicles change lanes, in the worlds after some have come and gone."""
         lanes = moment.crossing
-        plan, places, which, offsets, inputs, marks = bound.decides
-        plan[which, lane_change_loops.ADDRESS] = offsets + lanes.mid.data_ptr()
-        bound.clock[:] = moment.clock
-        if inputs:
-            pointers = self.pointers(moment)
-            self.commands.loops.run(0, self.rows, bound.ask.laid(begins, lambda: (pointers, *begins), pointers)[1])
-            for i, name in inputs:
-                where = self.commands.arrays.get(name)
-                plan[i, lane_change_loops.ADDRESS] = pointers[name] if where is None else address(where)
-        if not self.ring:
-            lane_change_loops.mark_led(lanes.decided, self.size, *lanes.whole_mid[1:3], marks["led"], marks["leads"])
+        pointers = self.pointers(moment)
+        cells, _ = bound.ask.laid(begins, lambda: (pointers, *begins), pointers)
+        lane_change_loops.each_row(self.looks.loops.call, lanes.decided, cells)
         blocks = dict(zip(self.layout.blocks, lanes.mid.view(len(lanes.mid), -1).numpy(), strict=True))
         world = lanes.whole_mid[: len(LINKS)], blocks["state_position"], blocks.get("state_present", self._absent)
-        choices = self.deciding.decide(self.wishes, world, (lanes.decided, stages), (plan, places))
+        choices = self.deciding.decide(self.looks.wishes, world, (lanes.decided, stages), bound.decides)
         if choices is None:
             raise Unordered("links are not the order of positions")
         lanes.fresh, lanes.merger = choices[:2]

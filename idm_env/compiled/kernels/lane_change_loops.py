@@ -411,12 +411,3 @@ def each_row(loops, rows, table):
     """Call loops over single rows."""
     for row in rows:
         call_rows(loops, row, row + 1, table)  # type: ignore[call-arg]
-
-
-@exact
-def mark_led(rows, n, leader, follower, led, leads):
-    """Write who has a leader and who a follower, as numbers."""
-    for row in rows:
-        for i in range(n):
-            led[row * n + i] = leader[row * n + i] != i
-            leads[row * n + i] = follower[row * n + i] != i

@@ -7,8 +7,11 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from idm_env.compiled.kernels import lane_change_loops
+from idm_env.compiled.kernels.lanes import part_of, starts, static_of
 from idm_env.compiled.kernels.printed import HEADER, printed
 from idm_env.compiled.kernels.tiles import ROW, Array
 from idm_env.compiled.scalar import library
@@ -17,6 +20,7 @@ from idm_env.compiled.scalar.record import Form
 from idm_env.compiled.scalar.wishes import HERE, SEARCHED, SIDES, Wishes
 from idm_env.roads import Lanes
 from idm_env.step import CarFollowingStep
+from idm_env.types import Inputs, Params, State
 
 
 class Decision:
@@ -92,7 +96,7 @@ def rows_of(slots: Sequence[Leaf], find: Callable[[int, str], tuple[int, int, in
     """Return the plan of a phase's rows and whose numbers these are; ``find`` returns an address and its strides."""
     rows, places = [], dict[tuple[int, int], int]()
     for i, slot in enumerate(slots):
-        side, name = _side(slot)
+        side, name = side_of(slot)
         if name in KINDS:
             rows.append((KINDS[name], side, 0, 0, 0, 0))
             continue
@@ -102,7 +106,22 @@ def rows_of(slots: Sequence[Leaf], find: Callable[[int, str], tuple[int, int, in
     return np.array(rows, np.int64), np.array(list(places), np.int64).reshape(-1, 2)
 
 
-def _side(slot: Leaf) -> tuple[int, str]:
+def side_of(slot: Leaf) -> tuple[int, str]:
     """Return the side of a slot, 0 for the own lane, and its name there."""
     first, _, rest = slot.name.partition(" ")
     return (SIDES.index(first) + 1, rest) if first in SIDES else (0, slot.name)
+
+
+def looked_at(simulator: CarFollowingStep, state: State, inputs: Inputs, params: Params, name: str) -> Tensor:
+    """Return what a row of the phase is filled with, of a state whose links are up to date."""
+    if name in ("led", "leads"):
+        assert isinstance(simulator.road, Lanes) and state.lanes is not None
+        if simulator.road.ring is not None:
+            return torch.ones((), dtype=state.speed.dtype)
+        other = state.lanes.leader if name == "led" else state.lanes.follower
+        return other != torch.arange(other.shape[-1], device=other.device)
+    if name.endswith(" now"):
+        return part_of(inputs, name)
+    if "." in name or name in ("length", "present"):
+        return static_of(simulator, state, params, name)
+    return starts(state, (name,))[0]

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from idm_env.compiled.kernels import lane_change_loops, lanes, order_loops
-from idm_env.compiled.kernels.lane_changes import Deciding, Decision, rows_of
+from idm_env.compiled.kernels import lane_change_loops, order_loops
+from idm_env.compiled.kernels.lane_changes import Deciding, Decision, looked_at, rows_of
 from idm_env.compiled.kernels.memory import addresses
 from idm_env.compiled.kernels.operands import dense, operand
 from idm_env.compiled.kernels.tiles import Array
@@ -170,7 +169,7 @@ class Traffic:
 
     def _operand(self, name: str, state: State, inputs: Inputs, params: Params) -> tuple[Array, int, int]:
         """Return an array and its strides by row and vehicle."""
-        x = self._array(name, state, inputs, params).to(state.speed.dtype)
+        x = looked_at(self.simulator, state._replace(lanes=self.lanes), inputs, params, name).to(state.speed.dtype)
         if not self._lasts(name):
             x = x.expand(self.shape).contiguous()  # strides that hold at every decision
         array, (_, by_row, by_vehicle) = operand(x, self.shape[:-1], self.n)
@@ -179,16 +178,3 @@ class Traffic:
     def _lasts(self, name: str) -> bool:
         """Whether this does not change in a rollout."""
         return "." in name or name == "length" or (name in ("led", "leads") and self.road.ring is not None)
-
-    def _array(self, name: str, state: State, inputs: Inputs, params: Params) -> Tensor:
-        if name in ("led", "leads"):
-            if self.road.ring is not None:
-                return torch.ones((), dtype=state.speed.dtype)
-            own = np.arange(self.n)
-            other = self._links[1 if name == "led" else 2].reshape(-1, self.n) != own
-            return torch.from_numpy(other).view(self.shape)
-        if name.endswith(" now"):
-            return lanes.part_of(inputs, name)
-        if "." in name or name in ("length", "present"):
-            return lanes.static_of(self.simulator, state, params, name)
-        return lanes.starts(state, (name,))[0]
