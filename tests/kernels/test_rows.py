@@ -84,6 +84,30 @@ def test_what_is_computed_twice_is_computed_once_unless_it_is_written_to():
     assert sum(key[0] == "exp" for key in loops._results) == 2
 
 
+def test_operations_of_simpler_ones_are_torchs_in_place_too():
+    def function(x, low):
+        which = torch.tensor([2, 0, 2])
+        parts = (
+            x.clamp(0.25, 0.75),
+            x.clamp_min(low),
+            x.clamp_max(0.5),
+            x.clone().clamp_(0.25),
+            x.clone().clamp_max_(low),
+        )
+        parts += x.masked_fill(x > low, -1.0), x.clone().masked_fill_(x < low, 2.0), torch.stack((x, low), 1)[:, 1]
+        parts += (
+            torch.zeros_like(x).index_add(1, which, x[:, :3]),
+            torch.ops.aten.select_backward(x[:, 0], x.shape, 1, -2),
+        )
+        return dict(zip("abcdefghij", parts, strict=True))
+
+    both = torch.rand(2, MANY, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    x, low = (each.clone() for each in both)
+    out = called(RowFunction(function, {"x": x, "low": low}, MANY), {"x": x.numpy(), "low": low.numpy()})
+    for name, expected in function(x, low).items():
+        assert np.array_equal(out[name], expected[:ROWS].numpy()), name
+
+
 def test_infinity_is_looked_for_in_numbers_of_their_own_kind():
     """It was looked for in truth values, among which there is none."""
     numbers = torch.tensor([[0.0, torch.inf, 1.0, -torch.inf, 2.0]]).expand(MANY, -1).contiguous()

@@ -59,15 +59,14 @@ def _layer_norm_back(
     return on_x, (g * normal).sum(rows) if needs[1] else None, g.sum(rows) if needs[2] else None
 
 
-_ATEN = torch.ops.aten
-_SIMPLER: dict[Any, Callable[..., Any]] = {
-    _ATEN.elu.default: _elu,
-    _ATEN.elu_backward.default: _elu_back,
-    _ATEN.silu.default: lambda x: x * torch.sigmoid(x),
-    _ATEN.silu_backward.default: _silu_back,
-    _ATEN.sigmoid_backward.default: lambda g, y: g * (1.0 - y) * y,
-    _ATEN.native_layer_norm.default: _layer_norm,
-    _ATEN.native_layer_norm_backward.default: _layer_norm_back,
+_SIMPLER: dict[str, Callable[..., Any]] = {
+    "elu": _elu,
+    "elu_backward": _elu_back,
+    "silu": lambda x: x * torch.sigmoid(x),
+    "silu_backward": _silu_back,
+    "sigmoid_backward": lambda g, y: g * (1.0 - y) * y,
+    "native_layer_norm": _layer_norm,
+    "native_layer_norm_backward": _layer_norm_back,
 }
 """What one operation is in terms of simpler ones."""
 
@@ -340,7 +339,6 @@ class PolicyRows(RowFunction):
 _SHARED = re.compile(r"\b(?:in_\w+|t\d+|c)\[[^\[\]]*\]")
 """An element of what is the same for all rows."""
 
-_ALONG, _SPREAD = ("sum", "mean", "cat"), ("slice_backward", "select_backward")
-_EACH = {*BINARY, *COMPARE, "where", "clamp", "clamp_min", "clamp_max", "clone", "_to_copy", "masked_fill", "mm"}
-_EACH |= {"addmm"}
+_ALONG, _SPREAD = ("sum", "mean", "cat"), ("slice_backward",)
+_EACH = {*BINARY, *COMPARE, "where", "clone", "_to_copy", "mm", "addmm"}
 """Operations that are told a dimension by its number, and others that all agents may do at once."""

@@ -69,29 +69,61 @@ class Place(NamedTuple):
     kind: str
 
 
+def _clamped(x: Tensor, low: Any = None, high: Any = None) -> Tensor:
+    for end, bound in ((torch.maximum, low), (torch.minimum, high)):
+        if bound is not None:
+            x = end(x, torch.as_tensor(bound, dtype=torch.float64 if isinstance(bound, float) else None))
+    return x
+
+
+def _index_added(x: Tensor, dim: int, which: Tensor, source: Tensor) -> Tensor:
+    shape = [-1 if d == dim % x.dim() else 1 for d in range(x.dim())]
+    return x.scatter_add(dim, which.view(shape).expand(source.shape), source)
+
+
+def _select_back(on: Tensor, sizes: Sequence[int], dim: int, i: int) -> Tensor:
+    whole: Tensor = torch.ops.aten.slice_backward(on.unsqueeze(dim), sizes, dim, i, i % sizes[dim] + 1, 1)
+    return whole
+
+
+SIMPLER: dict[str, Callable[..., Any]] = {
+    "clamp": _clamped,
+    "clamp_min": _clamped,
+    "clamp_max": lambda x, high: _clamped(x, None, high),
+    "masked_fill": lambda x, mask, value: torch.where(mask, value, x),
+    "index_add": _index_added,
+    "stack": lambda parts, dim=0: torch.cat([x.unsqueeze(dim) for x in parts], dim),
+    "select_backward": _select_back,
+}
+"""What one operation is in terms of simpler ones."""
+
+
 class _Recorder(Uncompiled, TorchDispatchMode):
     """Keeps every operation with its inputs and its results."""
 
-    def __init__(self, simpler: Mapping[Any, Callable[..., Any]]) -> None:
+    def __init__(self, simpler: Mapping[str, Callable[..., Any]]) -> None:
         super().__init__()
-        self._simpler = simpler
+        self._simpler = SIMPLER | dict(simpler)
         self.calls: list[tuple[str, tuple[Any, ...], dict[str, Any], Any]] = []
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func in self._simpler:
+        name = func._schema.name.removeprefix("aten::")
+        plain = name.removesuffix("_") if _in_place(name) else name
+        if plain in self._simpler:
             with self:
-                return self._simpler[func](*args, **(kwargs or {}))
+                result = self._simpler[plain](*args, **(kwargs or {}))
+                return result if plain == name else args[0].copy_(result)
         if torch.Tag.nondeterministic_seeded in func.tags:
             raise Untraceable(f"chance ({func._schema.name})")
         out = func(*args, **(kwargs or {}))
-        self.calls.append((func._schema.name.removeprefix("aten::"), args, kwargs or {}, out))
+        self.calls.append((name, args, kwargs or {}, out))
         return out
 
 
 def recorded(
     function: Callable[..., Mapping[str, Tensor]],
     inputs: Mapping[str, Tensor],
-    simpler: Mapping[Any, Callable[..., Any]],
+    simpler: Mapping[str, Callable[..., Any]],
 ) -> tuple[list[tuple[str, tuple[Any, ...], dict[str, Any], Any]], dict[str, Tensor]]:
     """Return the operations of one call of a function of tensors of any shape, and its result.
 
@@ -122,8 +154,8 @@ class RowFunction:
     """The loop over rows."""
     lean = True
     """Whether every element of the workspace stands in the text as such."""
-    simpler: Mapping[Any, Callable[..., Any]] = {}
-    """What stands for an operation, by its name in torch."""
+    simpler: Mapping[str, Callable[..., Any]] = {}
+    """What stands for an operation, by its name in torch, beside ``SIMPLER``."""
 
     def __init__(
         self, function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor], rows: int, *,
@@ -407,18 +439,14 @@ class RowFunction:
 
     def _compute(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], x: Tensor, to: Place) -> list[str]:
         shape = tuple(x.shape[1:])
-        if name in ("slice_backward", "select_backward"):
-            return self._spread(name, args, shape, to)
-        if name == "index_add":
-            return self._added(args, to)
+        if name == "slice_backward":
+            return self._spread(args, shape, to)
         if name == "gather":
             return self._gathered(args, shape, to)
         if name in ("scatter", "scatter_add", "scatter_reduce"):
             return self._scattered(name, args, kwargs, shape, to)
         if name == "copy":
             name, args = "clone", args[1:]
-        if name == "masked_fill":
-            name, args = "where", (args[1], args[2], args[0])
         if name in self.unary or name in ("_to_copy", "clone"):
             form = "np.tanh({0})" if name == "tanh" and to.kind == "d" else self.unary.get(name, "{0}")
             kind = None if name == "isinf" else to.kind
@@ -438,25 +466,21 @@ class RowFunction:
                 shape,
                 lambda cell: f"{self._at(y, cell, to.kind)} if {self._at(c, cell)} else {self._at(n, cell, to.kind)}",
             )
-        if name in ("clamp", "clamp_min", "clamp_max"):
-            return self._clamp(name, args, kwargs, shape, to)
         if name in REDUCE:
             return self._reduce(name, args, kwargs, x, to)
-        if name in ("cat", "stack"):
-            return self._joined(name, args, kwargs, x, to)
-        if name == "flip":
-            turned = {d % x.dim() - 1 for d in args[1]}
-            mirrored = [f"({n - 1} - {{}})" if k in turned else "{}" for k, n in enumerate(shape)]
-            return self._each(
-                to, shape, lambda cell: self._at(args[0], [m.format(j) for m, j in zip(mirrored, cell, strict=True)])
-            )
-        if name == "roll":
-            by = {d % x.dim() - 1: shift for shift, d in zip(args[1], args[2], strict=True)}
+        if name == "cat":
+            return self._joined(args, x, to)
+        if name in ("flip", "roll"):
+            by = {d % x.dim() - 1: s for s, d in zip(args[1], args[-1], strict=True)}
             if -1 in by or not by:
-                raise Untraceable("roll mixes rows")
-            shifted = [f"(({{}} + {-by[k] % n}) % {n})" if k in by else "{}" for k, n in enumerate(shape)]
+                raise Untraceable(f"{name} mixes rows")
+            form = "({} - {{}})" if name == "flip" else "(({{}} + {}) % {})"
+            moved = [
+                form.format(n - 1 if name == "flip" else -by[k] % n, n) if k in by else "{}"
+                for k, n in enumerate(shape)
+            ]
             return self._each(
-                to, shape, lambda cell: self._at(args[0], [m.format(j) for m, j in zip(shifted, cell, strict=True)])
+                to, shape, lambda cell: self._at(args[0], [m.format(j) for m, j in zip(moved, cell, strict=True)])
             )
         if name == "searchsorted":
             return self._searched(args, kwargs, x, to)
@@ -469,22 +493,6 @@ class RowFunction:
     def _common(self, args: Sequence[Any]) -> str:
         kinds = [self._kind(a) if isinstance(a, Tensor) else "f" if isinstance(a, float) else "i" for a in args]
         return next(kind for kind in "dfib" if kind in kinds)
-
-    def _clamp(
-        self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], shape: tuple[int, ...], to: Place
-    ) -> list[str]:
-        low = args[1] if name != "clamp_max" and len(args) > 1 else kwargs.get("min")
-        high = args[1] if name == "clamp_max" else args[2] if len(args) > 2 else kwargs.get("max")
-
-        def line(cell: list[str]) -> str:
-            text = self._at(args[0], cell, to.kind)
-            if low is not None:
-                text = BINARY["maximum"].format(text, self._at(low, cell, to.kind))
-            if high is not None:
-                text = BINARY["minimum"].format(text, self._at(high, cell, to.kind))
-            return text
-
-        return self._each(to, shape, line)
 
     def _reduce(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
         source = args[0]
@@ -514,23 +522,19 @@ class RowFunction:
 
         return self._loops(x.shape[1:], line)
 
-    def _joined(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
-        dim = (args[1] if len(args) > 1 else kwargs.get("dim", 0)) % x.dim() - 1
+    def _joined(self, args: Sequence[Any], x: Tensor, to: Place) -> list[str]:
+        dim = (args[1] if len(args) > 1 else 0) % x.dim() - 1
         if dim < 0:
-            raise Untraceable(f"{name} mixes rows")
+            raise Untraceable("cat mixes rows")
         lines, done = [], 0
         for part in args[0]:
-            width = 1 if name == "stack" else part.shape[dim + 1]
-            shape = [*x.shape[1:]]
-            shape[dim] = width
 
             def line(cell: list[str], part: Tensor = part, done: int = done) -> str:
                 target = [f"({done} + {j})" if k == dim else j for k, j in enumerate(cell)]
-                own = [j for k, j in enumerate(cell) if k != dim] if name == "stack" else cell
-                return f"{index(to, target)} = {self._at(part, own, to.kind)}"
+                return f"{index(to, target)} = {self._at(part, cell, to.kind)}"
 
-            lines += self._loops(shape, line)
-            done += width
+            lines += self._loops(part.shape[1:], line)
+            done += part.shape[dim + 1]
         return lines
 
     def _cumsum(self, args: Sequence[Any], x: Tensor, to: Place) -> list[str]:
@@ -545,19 +549,18 @@ class RowFunction:
 
         return self._loops(x.shape[1:-1], line)
 
-    def _spread(self, name: str, args: Sequence[Any], shape: tuple[int, ...], to: Place) -> list[str]:
-        """Print zeros with a part of them filled: what falls on the whole from a slice, or from one index."""
-        source, sizes, dim, *rest = args
+    def _spread(self, args: Sequence[Any], shape: tuple[int, ...], to: Place) -> list[str]:
+        """Print zeros with a part of them filled: what falls on the whole from a slice."""
+        source, sizes, dim, *ends, step = args
         k = dim % len(sizes) - 1
         if k < 0:
-            raise Untraceable(f"{name} mixes rows")
-        begin, end, step = (rest[0], rest[0] + 1, 1) if name == "select_backward" else rest
-        begin, end = (min(x + shape[k] if x < 0 else x, shape[k]) for x in (begin, end))
+            raise Untraceable("slice_backward mixes rows")
+        begin, end = (min(x + shape[k] if x < 0 else x, shape[k]) for x in ends)
         zero, many = self._number(0, to.kind), len(range(begin, end, step))
         if many == 1:
 
             def chosen(cell: list[str]) -> str:
-                own = [("0" if j == k else i) for j, i in enumerate(cell) if j != k or name == "slice_backward"]
+                own = [("0" if j == k else i) for j, i in enumerate(cell)]
                 return f"{index(to, cell)} = {self._at(source, own, to.kind)} if {cell[k]} == {begin} else {zero}"
 
             return self._loops(shape, chosen)
@@ -566,24 +569,9 @@ class RowFunction:
 
         def line(cell: list[str]) -> str:
             target = [f"({begin} + {i} * {step})" if j == k else i for j, i in enumerate(cell)]
-            own = [i for j, i in enumerate(cell) if j != k] if name == "select_backward" else cell
-            return f"{index(to, target)} = {self._at(source, own, to.kind)}"
+            return f"{index(to, target)} = {self._at(source, cell, to.kind)}"
 
         return [*lines, *self._loops(part, line)]
-
-    def _added(self, args: Sequence[Any], to: Place) -> list[str]:
-        """Print ``x.index_add(dim, index, source)``."""
-        x, dim, which, source = args
-        k = dim % x.dim() - 1
-        if k < 0 or self._known(which):
-            raise Untraceable("index_add of rows")
-
-        def line(cell: list[str]) -> str:
-            target = index(to, [self._at(which, [i]) if j == k else i for j, i in enumerate(cell)])
-            return f"{target} = {target} + {self._at(source, cell, to.kind)}"
-
-        first = self._each(to, x.shape[1:], lambda cell: self._at(x, cell, to.kind))
-        return [*first, *self._loops(source.shape[1:], line)]
 
     def _gathered(self, args: Sequence[Any], shape: tuple[int, ...], to: Place) -> list[str]:
         """Print ``source.gather(dim, which)``."""

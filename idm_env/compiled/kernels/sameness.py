@@ -19,7 +19,7 @@ from idm_env.compiled.scalar.record import Untraceable
 def digest(
     function: Callable[..., Mapping[str, Tensor]],
     inputs: Mapping[str, Tensor],
-    simpler: Mapping[Any, Callable[..., Any]],
+    simpler: Mapping[str, Callable[..., Any]],
     *,
     gradients: bool = False,
 ) -> bytes:
