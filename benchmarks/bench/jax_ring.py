@@ -12,7 +12,7 @@ DT, VEHICLES = 0.1, 22
 
 
 def window(count: int, steps: int, forward: bool = False) -> Callable[[], object] | None:
-    """Return a call that drives a window of so many rings, ``forward`` or also back; None where JAX is not installed."""
+    """Return a call that drives a window of rings ``forward``, or also back; None where JAX is not installed."""
     if not find_spec("jax"):
         return None
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")

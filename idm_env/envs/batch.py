@@ -142,7 +142,7 @@ class Present:
     seen: Any = None
     on_road: Any = None
     """What is observed, and which agents are on the road, as the last step told it."""
-    told: Mapping[str, Any] | None = None
+    outputs: Mapping[str, Any] | None = None
     outcome: Any = None
     """All that it told, and the same sorted: compiled loops fill the same arrays again and again."""
     draw: Draw | None = None
@@ -427,10 +427,10 @@ class Batch:
         if stepped is None:
             with torch.no_grad() if self.settings.output == "numpy" else contextlib.nullcontext():
                 stepped = self._step_torch(action, live, observed), 1
-        told, done = stepped
-        outcome = self.now.outcome if told is self.now.told else Outcome.of(told)
+        outputs, done = stepped
+        outcome = self.now.outcome if outputs is self.now.outputs else Outcome.of(outputs)
         if self.settings.output == "numpy":
-            self.now.told, self.now.outcome = told, outcome
+            self.now.outputs, self.now.outcome = outputs, outcome
         if self.counters is not None and self.counters.loops:
             self.counters.after(self.glance().state)
         if self.recording is not None:
@@ -514,7 +514,7 @@ class Batch:
         cut = None if world is None else mapped(lambda x: x.detach(), world)
         return {
             **self.__dict__,
-            "now": replace(self.now, world=cut, loaded=False, seen=None, driven=None, told=None),
+            "now": replace(self.now, world=cut, loaded=False, seen=None, driven=None, outputs=None),
             "values": None,
         }
 

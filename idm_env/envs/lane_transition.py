@@ -109,10 +109,10 @@ class Stage:
 
 
 class Looks:
-    """What drivers look at who think of changing lanes, as rows of their wishes: as loops over worlds, by number.
+    """The rows of wishes to change lanes, as loops over worlds: all that drivers look at, but parameters.
 
-    They see worlds after some have come and gone, and what agents have commanded in those before. ``wishes`` is None
-    where nobody changes lanes.
+    They see worlds after some have come and gone, and commands that agents have given in those before. ``wishes`` is
+    None where nobody changes lanes.
     """
 
     def __init__(self, step: WholeStep, plan: LaneTransition) -> None:
@@ -205,7 +205,7 @@ class LaneTransition(CompiledTransition):
 
     @cached_property
     def looks(self) -> Looks:
-        """What drivers look at who think of changing lanes. Untraceable where it, or a wish, cannot be recorded."""
+        """The rows of wishes to change lanes. Untraceable where they, or a wish, cannot be recorded."""
         return Looks(next(iter(self._recorded.values())), self)
 
     @cached_property

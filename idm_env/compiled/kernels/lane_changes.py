@@ -113,7 +113,7 @@ def side_of(slot: Leaf) -> tuple[int, str]:
 
 
 def looked_at(simulator: CarFollowingStep, state: State, inputs: Inputs, params: Params, name: str) -> Tensor:
-    """Return what a row of the phase is filled with, of a state whose links are up to date."""
+    """Return the numbers of a row of the phase, of a state ``(…, vehicles)`` whose links are up to date."""
     if name in ("led", "leads"):
         assert isinstance(simulator.road, Lanes) and state.lanes is not None
         if simulator.road.ring is not None:
