@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import idm_env  # noqa: F401
+from idm_env import backends
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.tasks import make_task
 
@@ -126,11 +129,28 @@ def test_gradients_flow_through_steps_and_changes() -> None:
     torch.testing.assert_close(slope[0], expected, rtol=1e-5, atol=1e-8)
 
 
+def test_few_vehicles_change_lanes_as_many_do() -> None:
+    """Of fewer than a vector of the machine, too: gaps to new leaders as torch has them, and as positions say."""
+    states = []
+    for path in (contextlib.nullcontext(), backends.off()):
+        with path:
+            env = gym.make("DiffIDM-v0", task="highway", vehicles=5, length=300.0, hold=1.0, warmup=0, dtype="float64")
+            env.reset(seed=0)
+            for _ in range(10):
+                env.step(None)
+            states.append(env.unwrapped.state)
+    compiled, plain = states
+    assert int(plain.lanes.changed.sum()) > 0
+    torch.testing.assert_close(compiled.gap, plain.gap, rtol=0.0, atol=1e-9)
+    round_ring = compiled.position.gather(-1, compiled.lanes.leader) - 5.0 - compiled.position - compiled.gap
+    torch.testing.assert_close(round_ring.remainder(300.0).sub(150.0).abs(), torch.full_like(round_ring, 150.0))
+
+
 def test_desired_speeds_are_spread_and_bad_roads_are_refused() -> None:
     """In one line each."""
     speeds = make_task("highway", spread=0.2).params(torch.float64, "cpu")["idm"]["desired_speed"]
     assert 24.0 <= speeds.min() < 25.0 and 35.0 < speeds.max() <= 36.0
-    with pytest.raises(ValueError, match="do not fit 4 lanes of 100 m"):
+    with pytest.raises(ValueError, match="do not fit 2 lanes of 100 m"):
         make_task("highway", length=100.0, vehicles=80)
     with pytest.raises(ValueError, match="spread = 1 must be below 1"):
         make_task("highway", spread=1.0)
