@@ -194,9 +194,9 @@ def our_highway(vector: int, seconds: float) -> float:
     """Return env steps per CPU second of ``highway`` with 50 vehicles (51 in a single one), random actions."""
     draw = np.random.default_rng(1)
     if vector == 1:
-        single = gymnasium.make("DiffIDM-v0", task="highway", vehicles=51, lanes_count=4)
+        single = gymnasium.make("DiffIDM-v0", task="highway", vehicles=51, lanes_count=4, warmup=0)
         return rate(turning(single, lambda: draw.uniform(-1, 1, 1).astype(np.float32)), seconds)
-    many = gymnasium.make_vec("DiffIDM-v0", num_envs=vector, task="highway", vehicles=50, lanes_count=4)
+    many = gymnasium.make_vec("DiffIDM-v0", num_envs=vector, task="highway", vehicles=50, lanes_count=4, warmup=0)
     block = draw.uniform(-1, 1, (vector, 1)).astype(np.float32)
     many.reset(seed=1)
     return rate(lambda: many.step(block), seconds) * vector

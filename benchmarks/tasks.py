@@ -43,8 +43,7 @@ EPISODES, FRESH, OTHERS = 64, 1 << 20, 1 << 19
 """Episodes that judge, their first seed, and that of episodes which choose constants and rules."""
 CONSTANTS = (-0.3, -0.1, -0.03, -0.01, -0.003, 0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
 GIVEN: dict[str, dict[str, Any]] = {
-    "ring": {"hold": 1.0}, "follow": {"hold": 0.5}, "platoon": {"hold": 1.0},
-    "highway": {"hold": 1.0, "warmup": 100, "lanes_count": 2, "vehicles": 20},
+    "ring": {"hold": 1.0}, "follow": {"hold": 0.5}, "platoon": {"hold": 1.0}, "highway": {"hold": 1.0},
     "replay": {"hold": 0.5}, "replay_lanes": {"hold": 0.5},
 }  # fmt: skip
 """Keywords of each task here: agents decide at most twice a second."""

@@ -28,10 +28,12 @@ RECIPES = {
     "approach": (15, 8, 120, 3e-3, (16.0, 1.0, 2.0, 1.4, 2.0, 1.0)),
     "highway": (20, 8, 300, 3e-3, (40.0, 0.106, 3.65, 3.0, 1.84, 0.17)),
 }
-# The recipes are for the scales of the sources, which may be negative; the ring is Flow's, on which nobody brakes.
+# The recipes are for the scales of the sources, which may be negative; the ring is Flow's, on which nobody brakes, and
+# highway's that of HighwayEnv.
 SOURCES = {
     "ring": {"reward": "flow", "shock": 0.0, "warmup": 750}, "follow": {"reward": "source"},
     "platoon": {"reward": "quadratic"}, "replay": {"reward": "imitation"}, "replay_lanes": {"reward": "imitation"},
+    "highway": {"vehicles": 50, "lanes_count": 4, "warmup": 0},
     **{name: {"reward": "delay", "controlled": 0.1, "careful": True, "added": False} for name in OPEN},
 }  # fmt: skip
 

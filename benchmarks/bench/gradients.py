@@ -21,6 +21,7 @@ from benchmarks.bench.measure import Case, measure
 from idm_env import Effect, Parameter
 
 RING: dict[str, Any] = {"failsafe": 3.0, "max_command": 0.02}
+FOUR_LANES = {"vehicles": 50, "lanes_count": 4, "warmup": 0}
 COUNTS = ((1, 600), (64, 600), (1024, 100))
 """Environments, and steps of a window."""
 MODEL = "configures: model\nschema: 1\neffects: [idm, brakes]\nparameters: {idm: {time_gap: 1.2}}\n"
@@ -82,7 +83,7 @@ def workloads() -> list[tuple[str, Callable[[], dict[str, Case]]]]:
         result.append((f"ring, {count} × {steps}", partial(_beside_jax, count, steps)))
     for task in ("highway", "merge"):
         for count, steps in ((1, 100), (64, 50), (1024, 5)):
-            lanes = {"task": task, "hold": 0.1}  # a step of Δt
+            lanes = {"task": task, "hold": 0.1, **(FOUR_LANES if task == "highway" else {})}  # a step of Δt
             result.append((f"{task}, {count} × {steps}", partial(of, lanes, count, steps, False)))
     result.append(("ring of other drivers, 64 × 200", _others))
     return result

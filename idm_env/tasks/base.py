@@ -34,7 +34,7 @@ from idm_env.types import Command, Inputs, Params, State, mapped
 from idm_env.validation import nearest, whole
 
 _NORMALS_AT_ONCE = 1 << 16
-_AS_MANY = " All episodes have as many: draw inflow, or give a ring length=[186, 268]."
+_AS_MANY = " Task 'highway' draws vehicles; elsewhere draw inflow, or give a ring length=[186, 268]."
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,7 +58,8 @@ class Task(abc.ABC):
             names is everybody's.
         randomise: Ranges from which every episode draws anew, evenly: parameters, for all its drivers alike (domain
             randomisation), ``{"idm": {"time_gap": [0.8, 1.2]}}`` or ``{"idm.time_gap": [0.8, 1.2]}``, over
-            ``parameters`` and ``drivers``; and the demand of open roads, ``{"inflow": [1500, 2500]}``.
+            ``parameters`` and ``drivers``; the demand of open roads, ``{"inflow": [1500, 2500]}``; and how many drive
+            on ``highway``, ``{"vehicles": [18, 26]}``.
         noise: Standard deviation of the drivers' noise N, added as ``accel += √Δt N(0, noise²)`` (m/s² per √s); 0 is
             none.
         warmup: Steps before an episode begins, in which nobody is controlled.
@@ -118,7 +119,7 @@ class Task(abc.ABC):
     machinery: ClassVar[tuple[Effect, ...]] = (Control(),)
     """Effects through which the task itself acts; they are always there, and take inputs that the task gives."""
     ranges: ClassVar[Mapping[str, Range]] = {
-        "vehicles": Range(0, 100_000, whole=True),
+        "vehicles": Range(1, 100_000, whole=True),
         "vehicle_length": Range(0.1, 100.0, "m"),
         "dt": Range(1e-3, 5.0, "s"),
         "noise": Range(0.0, 10.0, "m/s²"),
@@ -142,6 +143,20 @@ class Task(abc.ABC):
     """Keywords beside parameters that ``randomise`` takes."""
     begins_with: ClassVar[tuple[str, ...]] = ()
     """Keywords that only the beginning of an episode looks at: ``reset(options={…})`` takes them."""
+    shares: ClassVar[int] = 1
+    """Number of agents that share the cost of a crash by the mean of their rewards: 1 if all crash together."""
+    journeys: ClassVar[int] = 0
+    """Most trips of an agent's slot in an episode; 0 for agents that are on the road from the start."""
+    as_driver: ClassVar[float] = 0.0
+    """Action by which a vehicle does as its driver would; 0 where there is none, and 0 commands 0 m/s²."""
+    commands: ClassVar[tuple[str, ...]] = ("accel",)
+    """What an agent commands: an action holds the first of all agents, then the second of all, and so on."""
+    levels: ClassVar[tuple[int, ...] | None] = None
+    """How many values each command of an agent may have, evenly from −1 to 1; None: any number in between."""
+    pairs: ClassVar[int] = 0
+    """How many pairs of vehicles an observation looks at, for which it takes memory."""
+    vehicle_ids: ClassVar[tuple[str, ...] | None] = None
+    """Recorded ids of all vehicles, or None where nothing is recorded but leaders."""
 
     def __post_init__(self) -> None:
         in_ranges(self)
@@ -232,31 +247,6 @@ class Task(abc.ABC):
         if self.crash_cost is not None:
             return self.crash_cost
         return self.shares * lawful_cost(self.reward_range, -(-self.steps // self.held))
-
-    @property
-    def shares(self) -> int:
-        """Number of agents that share the cost of a crash by the mean of their rewards: 1 if all crash together."""
-        return 1
-
-    @property
-    def journeys(self) -> int:
-        """Most trips of an agent's slot in an episode; 0 for agents that are on the road from the start."""
-        return 0
-
-    @property
-    def as_driver(self) -> float:
-        """Action by which a vehicle does as its driver would; 0 where there is none, and 0 commands 0 m/s²."""
-        return 0.0
-
-    @property
-    def commands(self) -> tuple[str, ...]:
-        """What an agent commands: an action holds the first of all agents, then the second of all, and so on."""
-        return ("accel",)
-
-    @property
-    def levels(self) -> tuple[int, ...] | None:
-        """How many values each command of an agent may have, evenly from −1 to 1; None: any number in between."""
-        return None
 
     @property
     def lanes(self) -> tuple[int, ...]:
@@ -384,8 +374,8 @@ class Task(abc.ABC):
                     f"idm.time_gap can.{like}"
                 )
         spans = {k: two_ends(f"randomise.{k}", v) for k, v in choices.items() if k in self.can_draw}
-        for name, ends in spans.items():
-            for end in ends:
+        for name in spans:
+            for end in choices[name]:
                 ranges(type(self))[name].check(f"randomise.{name}", end)
         return spans
 
@@ -396,11 +386,6 @@ class Task(abc.ABC):
     def _agent_slots(self) -> list[int]:
         own = {vehicle: slot for slot, vehicle in enumerate(self.agents)}
         return [own.get(i, 0) for i in range(self.vehicles)]
-
-    @property
-    def pairs(self) -> int:
-        """How many pairs of vehicles an observation looks at, for which it takes memory."""
-        return 0
 
     def pick(self, x: Tensor) -> Tensor:
         """Return what belongs to the controlled vehicles, shape ``(…, agents)``."""
@@ -627,11 +612,6 @@ class Task(abc.ABC):
         return Ended(crashed, torch.zeros_like(crashed))
 
     # -- words -----------------------------------------------------------------------------------------------------
-
-    @property
-    def vehicle_ids(self) -> tuple[str, ...] | None:
-        """Recorded ids of all vehicles, or None where nothing is recorded but leaders."""
-        return None
 
     def crash_reason(self, world: EnvState, row: int, agent: int | None = None) -> str:
         """Return who touched whom in one environment that has crashed, when and how deep; ``agent`` asks for its own.

@@ -65,6 +65,7 @@ class FollowTask(BehindHeadTask):
     own_parameters: ClassVar = {
         "idm": {"max_accel": 1.3, "comfort_decel": 2.0, "time_gap": 1.0, "min_gap": 2.0, "desired_speed": 45.0}
     }
+    own_features: ClassVar[tuple[Feature, ...]] = SEEN  # type: ignore[override]
     ranges: ClassVar[Mapping[str, Range]] = {"fuel_weight": Range(0.0, 1e6), "lag_weight": Range(0.0, 1e6)}
 
     vehicles: int = 7
@@ -100,11 +101,6 @@ class FollowTask(BehindHeadTask):
         """The recorded leaders."""
         dt = self.simulator.dt
         return made_up_leader(dt) if self.leader is None else recorded_leaders(str(self.leader), dt)
-
-    @property
-    def own_features(self) -> tuple[Feature, ...]:
-        """Speeds up to 100 m/s, gaps from an overlap to 1000 m."""
-        return SEEN
 
     @property
     def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:

@@ -63,7 +63,7 @@ class LanesTask(Task):
             raise ValueError(f"spread = {self.spread:g} must be below 1: desired speeds are positive.")
 
     @property
-    def pairs(self) -> int:
+    def pairs(self) -> int:  # type: ignore[override]
         """Every agent looks at all vehicles, to find the nearest."""
         return len(self.agents) * self.vehicles
 
@@ -92,12 +92,12 @@ class LanesTask(Task):
         return {"lane_changes": self.pick(lanes.changed), "lane_refusals": self.pick(lanes.blocked + lanes.refused)}
 
     @property
-    def commands(self) -> tuple[str, ...]:
+    def commands(self) -> tuple[str, ...]:  # type: ignore[override]
         """Acceleration, and the lane where that is asked for."""
         return ("accel", "lane") if self.lane_commands else ("accel",)
 
     @property
-    def levels(self) -> tuple[int, ...] | None:
+    def levels(self) -> tuple[int, ...] | None:  # type: ignore[override]
         """Levels of acceleration, and the three of lanes."""
         return (self.discrete, 3)[: len(self.commands)] if self.discrete else None
 

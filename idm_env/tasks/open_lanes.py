@@ -125,6 +125,8 @@ class OpenLanesTask(LanesTask):
     most_filled: ClassVar[float] = 300.0
     ramp: ClassVar[int | None] = None
     """The lane whose demand is ``ramp_inflow``."""
+    exits: ClassVar[Mapping[str, float]] = {}
+    """Names of destinations beside the end of the road, and up to where one must have changed for them (m)."""
     ranges: ClassVar[Mapping[str, Range]] = {"entry_speed": Range(1.0, 70.0, "m/s"), "inflow": FLOW}
 
     vehicles: int = 120
@@ -217,11 +219,6 @@ class OpenLanesTask(LanesTask):
         """Whether the only agent is one that enters again as soon as it has left: ``controlled=1``."""
         return self.table is None and self.controlled == 1 and isinstance(self.controlled, int)
 
-    @property
-    def exits(self) -> Mapping[str, float]:
-        """Names of destinations beside the end of the road, and up to where one must have changed for them (m)."""
-        return {}
-
     @cached_property
     def _classes(self) -> dict[str, DriverClass]:
         return classes_of(self.classes, self.vehicle_length)
@@ -263,7 +260,7 @@ class OpenLanesTask(LanesTask):
         return values
 
     @property
-    def as_driver(self) -> float:
+    def as_driver(self) -> float:  # type: ignore[override]
         """A careful command of the driver's own maximum, which never holds him back; 0 where it is added to his."""
         most = self.params(torch.float64, "cpu")[self.simulator.base.name].get("max_accel")
         is_whole = self.careful and not self.added
@@ -409,7 +406,7 @@ class OpenLanesTask(LanesTask):
         return own | {n: x.unsqueeze(-1).expand(-1, len(self.agents)).contiguous() for n, x in every.items()}
 
     @property
-    def journeys(self) -> int:
+    def journeys(self) -> int:  # type: ignore[override]
         """One that began before the episode, one that is due at once, and one for every time that a slot's are due."""
         if self.table is not None:
             return 1

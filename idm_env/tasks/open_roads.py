@@ -94,7 +94,7 @@ class OpenHighwayTask(OpenLanesTask):
         return (*self.closures, {"lane": 0, "begin": on[1], "end": off[0]}) if on and off else self.closures
 
     @property
-    def exits(self) -> Mapping[str, float]:
+    def exits(self) -> Mapping[str, float]:  # type: ignore[override]
         """The off-ramp."""
         off = self._ramps[1]
         return {"exit": off[1]} if off else {}

@@ -13,7 +13,7 @@ from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Ended, EnvState, Task
-from idm_env.tasks.checks import count_of, in_ranges
+from idm_env.tasks.checks import Range, count_of, in_ranges
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import Feature
 from idm_env.tasks.follow import HIGHEST, KNEE, LOWEST, SEEN
@@ -58,6 +58,8 @@ class ReplayTask(Task):
     own_effects: ClassVar[tuple[Effect, ...]] = (IDM(), Brakes())
     own_parameters: ClassVar = {}
     machinery: ClassVar[tuple[Effect, ...]] = (Control(), Replay())
+    own_features: ClassVar[tuple[Feature, ...]] = SEEN  # type: ignore[override]
+    ranges: ClassVar[Mapping[str, Range]] = {"vehicles": Range(0, 100_000, whole=True)}
 
     vehicles: int = 0
     controlled: Any = 1
@@ -113,14 +115,9 @@ class ReplayTask(Task):
         return self.scene.lane
 
     @property
-    def vehicle_ids(self) -> tuple[str, ...]:
+    def vehicle_ids(self) -> tuple[str, ...]:  # type: ignore[override]
         """The recorded id of each slot."""
         return self.scene.ids
-
-    @property
-    def own_features(self) -> tuple[Feature, ...]:
-        """Speeds up to 100 m/s, gaps from an overlap to 1000 m."""
-        return SEEN
 
     @property
     def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
@@ -131,7 +128,7 @@ class ReplayTask(Task):
         return {"unit": {record: 1.0}, "imitation": {imitation: 1.0}, "source": {source: 1.0}}
 
     @property
-    def shares(self) -> int:
+    def shares(self) -> int:  # type: ignore[override]
         """The number of agents: one of them ends the episode of a single environment, which pays their mean."""
         return len(self.agents)
 

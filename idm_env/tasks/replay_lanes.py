@@ -120,7 +120,7 @@ class ReplayLanesTask(ReplayTask, LanesTask):
         return (*super().features_of_self, feature("lead_speed", 20.0, 0.0, FASTEST), FEATURES["gap"])
 
     @property
-    def own_features(self) -> tuple[Feature, ...]:
+    def own_features(self) -> tuple[Feature, ...]:  # type: ignore[override]
         """As in ``LanesTask``."""
         return super(ReplayTask, self).own_features
 

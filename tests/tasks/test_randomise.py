@@ -108,6 +108,39 @@ def test_demand_is_drawn_for_every_episode_and_given_at_a_reset() -> None:
     assert max(inside[:2]) < 10.0 < inside[2]
 
 
+def test_an_agent_is_in_every_episode_whose_vehicles_are_drawn() -> None:
+    said = r"= \[18, 26\] leaves vehicle 20 out, which is an agent\. Control vehicles below 18, or draw more\."
+    with pytest.raises(ValueError, match=said):
+        make_task("highway", controlled=[3, 20], randomise={"vehicles": [18, 26]})
+
+
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_a_world_of_fewer_vehicles_is_the_world_of_that_number(output: str) -> None:
+    """Bit for bit, on every face; all numbers of the range are drawn, and a window is a loop of steps."""
+    keywords = {"task": "highway", "length": 250.0, "hold": 1.0, "warmup": 20, "output": output}
+    drawn = {**keywords, "randomise": {"vehicles": [4, 5]}}
+    env, alone = gymnasium.make_vec("DiffIDM-v0", num_envs=4, **drawn), gymnasium.make("DiffIDM-v0", **drawn)
+    given, _ = env.reset(seed=3)
+    first, counts = np.array(torch.as_tensor(given)), env.unwrapped.batch.world.state.present.sum(-1).long().tolist()
+    assert set(counts) == {4, 5}
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (15, 4, 1)).astype(np.float32)
+    given_as = torch.tensor if output == "torch" else np.array
+    steps = [env.step(given_as(action)) for action in actions]
+    fixed = {n: gymnasium.make("DiffIDM-v0", vehicles=n, **keywords) for n in (4, 5)}
+    for i, count in enumerate(counts):
+        for face in (fixed[count], alone):
+            seen, _ = face.reset(seed=3 + i)
+            np.testing.assert_array_equal(seen, first[i])
+            for action, step in zip(actions, steps, strict=True):
+                for own, every in zip(face.step(given_as(action[i]))[:4], step[:4], strict=True):
+                    np.testing.assert_array_equal(own, every[i])
+    if output == "torch":
+        env.reset(seed=3)
+        moves = iter(torch.tensor(actions))
+        window = env.unwrapped.unroll(lambda seen: next(moves), steps=15)
+        torch.testing.assert_close(window.reward, torch.stack([step[1] for step in steps]), rtol=1e-6, atol=0.0)
+
+
 @pytest.mark.parametrize(
     ("task", "randomise", "said"),
     [
@@ -122,8 +155,13 @@ def test_demand_is_drawn_for_every_episode_and_given_at_a_reset() -> None:
         (
             "ring",
             {"vehicles": [18, 26]},
-            "can. All episodes have as many: draw inflow, or give a ring length=[186, 268]",
+            "can. Task 'highway' draws vehicles; elsewhere draw inflow, or give a ring length=[186, 268]",
         ),
+        ("highway", {"vehicles": [26, 18]}, "randomise.vehicles = [26, 18] must rise: write [18, 26]."),
+        ("highway", {"vehicles": [18.5, 26]}, "randomise.vehicles = 18.5 must be a whole number."),
+        ("highway", {"vehicles": [0, 26]}, "randomise.vehicles = 0 must be at least 1."),
+        ("highway", {"vehicles": 20}, "randomise.vehicles = 20 must be [lowest, highest]."),
+        ("highway", {"vehicles": [18, 900]}, "900 vehicles of 5 m and a metre each do not fit 2 lanes of 1000 m."),
     ],
 )
 def test_what_cannot_be_drawn_is_told_with_what_can(task: str, randomise: dict[str, object], said: str) -> None:

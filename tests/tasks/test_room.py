@@ -34,7 +34,7 @@ CASES = [(name, given) for name in OPEN for given in DENSE] + [
     ("approach", {"platoon": 0.1}), ("approach", {"lanes_count": 1, "inflow": 1800.0}),
     ("merge", {"ramp_inflow": 3000.0}), ("open_highway", {"on_ramp": [100.0, 200.0]}),
     ("open_highway", {"on_ramp": [100.0, 200.0], "off_ramp": [300.0, 380.0]}),
-    ("highway", {"vehicles": 660}), ("highway", {"vehicle_length": 75.0}),
+    ("highway", {"vehicles": 330, "warmup": 0}), ("highway", {"vehicle_length": 94.0, "warmup": 0}),
     ("ring", {"vehicles": 40, "warmup": 0}), ("ring", {"vehicles": 40, "start": "wave", "warmup": 0}),
     ("platoon", {"vehicle_length": 30.0}), ("follow", {"vehicle_length": 30.0}),
 ]  # fmt: skip
