@@ -25,16 +25,19 @@ demo: $(VENV)/.data
 	$(BIN)/idm-env demo $(if $(DATA),--data '$(DATA)') --out '$(OUT)'
 
 # Most tests, of compiled code above all, run it as users do. Those that make many environments and step each of them a little
-# compile it unoptimised, which takes half the time. Each file on one worker, which compiles its programs once.
+# compile it unoptimised, which takes half the time. Each file on one worker, which compiles its programs once; those that take
+# longest stand first, so that no worker waits for another in the end.
 FACES := $(addprefix tests/envs/test_,gym.py pettingzoo.py sb3.py render.py limits.py fitting_wrapper.py)
-LITTLE := tests/agents tests/tasks $(addprefix tests/envs/test_,recording.py unroll.py step_gradients.py) $(FACES) \
-  tests/laws/test_printed.py tests/kernels/test_policy_rows.py \
-  $(filter-out $(addprefix tests/test_,cli.py docs.py docs_commands.py examples.py faults.py),$(wildcard tests/test_*.py))
+COMMANDS := $(addprefix tests/test_,cli.py docs.py docs_commands.py examples.py faults.py)
+LITTLE := $(filter-out $(COMMANDS),$(wildcard tests/test_*.py)) tests/agents/ tests/tasks/ \
+  $(addprefix tests/envs/test_,recording.py unroll.py step_gradients.py) $(FACES) \
+  tests/laws/test_printed.py tests/kernels/test_policy_rows.py
+MUCH := $(COMMANDS) $(filter-out $(LITTLE),$(sort $(dir $(wildcard tests/*/test_*.py))))
 TEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST)
 test: test-much test-little
 
 test-much: setup
-	$(TEST) $(addprefix --ignore=,$(LITTLE)) tests
+	$(TEST) $(addprefix --ignore=,$(filter-out %/,$(LITTLE))) $(MUCH)
 
 test-little: setup
 	NUMBA_OPT=0 $(TEST) $(LITTLE)
