@@ -29,6 +29,8 @@ LAG_S = 10.0
 """How long ago what a leader did may still be answered to."""
 RIDGES = (0.003, 0.03, 0.3)
 """Weights of the prior of coefficients of scaled features, in units of the number of windows."""
+STOP_S = 90.0
+"""How long after a stop drivers may still answer to it."""
 KNOTS = 6
 """Of curves over the past, from the 0.2nd to the 99.8th percentile."""
 USUAL = 1.0
@@ -54,20 +56,22 @@ def find(responses: Responses, seed: int) -> Shared | None:
     residuals. Chance: each vehicle's residuals turned by a random time, which keeps what lasts in a driver, and, as
     vehicles behind each other are unsteady at the same times (all move, or all stand), no less than the root of the
     sum of these products squared; p of a normal score, times the number of runs. The interval is the one of time in
-    which an added acceleration explains most of that run, drivers re-calibrated. Residuals are those ``beyond`` what
-    the leaders' motion foretells, and the past by ``past_out``: followers of one leader have one past.
+    which an added acceleration explains most of that run, drivers re-calibrated. Followers of one leader have one past,
+    so a run has to stand out in what is measured and ``beyond`` what the leaders' motion foretells, and the past by
+    ``past_out``: that may err in a run whose past is unlike all others. What comes ``after_stops`` does not count.
     """
-    left = beyond(past_out(responses), leaders(responses.rows), responses.rows.run)
-    responses = replace(responses, residual=left)
     rows, records = responses.rows, responses.rows.records
+    counts = ~after_stops(rows, responses.coordinates["time_since_stop"][:, 0])
+    left = counts[:, None] * beyond(past_out(responses), leaders(rows), rows.run)
+    both = replace(responses, residual=np.hstack([counts[:, None] * responses.residual, left]))
     number = np.round(records.column("time")[rows.start] / (rows.steps * records.dt)).astype(int)
     random = np.random.default_rng(seed)
     score, vehicles = np.full(len(records.runs), np.nan), np.zeros(len(records.runs), int)
     for run in range(len(records.runs)):
-        tables = _tables(responses, run, number)
+        tables = _tables(both, run, number)
         vehicles[run] = len(tables)
         if len(tables) > 1 and tables.shape[1] > 3:
-            score[run] = standing_out(tables, random)
+            score[run] = min(standing_out(table, random) for table in np.split(tables, 2, axis=-1))
     tested = int(np.isfinite(score).sum())
     if tested < FEWEST_RUNS:
         return None
@@ -75,14 +79,23 @@ def find(responses: Responses, seed: int) -> Shared | None:
     p_value = float(normal.sf(score[run])) * tested
     if p_value > ALPHA or np.nanmedian(np.delete(score, run)) > USUAL:
         return None
-    mine = rows.run == run
-    of_run = replace(responses, change=responses.change * mine[:, None], residual=responses.residual * mine[:, None])
+    mine = (rows.run == run) & counts
+    of_run = replace(responses, change=responses.change * mine[:, None], residual=left * mine[:, None])
     # Of an interval and the rest of the run drivers' parameters make one and the same: it is the shorter one.
     time = responses.coordinates["time"][mine]
     stretch = scan(of_run, "acceleration", "time", 5.0, longest=0.5 * float(time.max() - time.min()))
     if stretch is None:
         return None
     return Shared(records.runs[run], stretch.begin, stretch.end, stretch.amount, int(vehicles[run]), p_value)
+
+
+def after_stops(rows: Rows, since: np.ndarray) -> np.ndarray:
+    """Return which rows [R] begin less than ``STOP_S`` after their driver stood, ``since`` [R] s ago.
+
+    None does where only one run has such rows: nothing elsewhere tells how drivers answer to a stop.
+    """
+    after: np.ndarray = since < STOP_S
+    return after & (len(np.unique(rows.run[after])) > 1)
 
 
 def past_out(responses: Responses) -> np.ndarray:

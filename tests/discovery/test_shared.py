@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from idm_env.discovery.places import WHATS, Responses
+from benchmarks import undeclared
+from idm_env.discovery import shared
+from idm_env.discovery.places import WHATS, Responses, respond
 from idm_env.discovery.records import Rows
-from idm_env.discovery.shared import beyond, past_out, standing_out
+from idm_env.discovery.shared import after_stops, beyond, past_out, standing_out
 from idm_env.discovery.units import Units
 from idm_env.effects.free import HISTORY
+from tests.discovery.test_replica import fitted_to
 
 
 def _runs(number: int, unsteady: float) -> list[np.ndarray]:
@@ -75,3 +78,19 @@ def test_what_followers_do_of_one_past_is_no_cause_of_a_run(of_past: bool) -> No
     left = past_out(part)
     before, after = (standing_out(x.reshape(runs, 3, count, 12)[3], np.random.default_rng(0)) for x in (residual, left))
     assert before > 3.0 and (after < 3.0 if of_past else after > 3.0), (before, after)
+
+
+def test_followers_of_one_stop_are_no_cause_of_a_run() -> None:
+    """Time gaps are longer after a stop, and run 5 stops twice: told as "run 5 between 34 and 84 s"."""
+    job = undeclared.Job("after a stop", 0.0, 920_000)
+    assert shared.find(respond(*fitted_to(undeclared.generated(job))), job.seed) is None
+
+
+@pytest.mark.parametrize(("stopped", "counts"), [((2, 5), [True, True, False, False]), ((5,), [True] * 4)])
+def test_what_comes_after_a_stop_tells_of_a_run_only_where_no_other_stops(
+    stopped: tuple[int, ...], counts: list[bool]
+) -> None:
+    run, since = np.repeat([2, 5], 4), np.tile([99.0, 90.0, 40.0, 0.0], 2)
+    rows = cast(Rows, SimpleNamespace(run=run))
+    after = after_stops(rows, np.where(np.isin(run, stopped), since, 99.0))
+    assert (~after[4:]).tolist() == counts
