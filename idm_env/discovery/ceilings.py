@@ -96,9 +96,8 @@ def drift(trajectories: Trajectories) -> float:
         leaders, on=["run_id", "leader_id", "step"], how="inner", maintain_order="left"
     )
     sums, counts = np.zeros(len(LAGS_S)), np.zeros(len(LAGS_S))
-    for (run, _, _), part in both.partition_by(
-        ["run_id", "vehicle_id", "leader_id"], as_dict=True, maintain_order=True
-    ).items():
+    pair = ["run_id", "vehicle_id", "leader_id"]
+    for (run, _, _), part in both.partition_by(pair, as_dict=True, maintain_order=True).items():
         dt = trajectories.steps[run]
         time = part["time_s"].to_numpy()
         opening = (part["lead_speed"] - part["speed_mps"]).to_numpy()
@@ -122,9 +121,5 @@ def floor(records: Records, drift_m: float) -> dict[str, float]:
     """Return the errors that sensors alone would leave: white noise, and what a gap drifts by (m/√s) till corrected."""
     white = judge.floor(records)
     slow = drift_m**2 * CORRECTED_S / 2.0
-    return white | {
-        "gap_rmse_m": float(np.sqrt(white["gap_rmse_m"] ** 2 + slow)),
-        "gap_rmse_median_driver_m": float(np.sqrt(white["gap_rmse_median_driver_m"] ** 2 + slow)),
-        "horizon_rmse_m": float(np.sqrt(white["horizon_rmse_m"] ** 2 + slow)),
-        "drift_m_per_sqrt_s": drift_m,
-    }
+    gaps = {name: float(np.sqrt(m**2 + slow)) for name, m in white.items() if name != "speed_rmse_mps"}
+    return white | gaps | {"drift_m_per_sqrt_s": drift_m}

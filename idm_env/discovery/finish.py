@@ -118,12 +118,11 @@ def finished(
         ladder = judgement.climbed(prepared, pooled, floor["horizon_rmse_m"])
         if not (judgement.added or judgement.law or judgement.fleet or judgement.is_exact(least)):
             leading = decided.rounds[0].leading
-            noisy, agreements = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
+            noisy, agree = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
             errors = replica.ahead(everywhere[0], everywhere[1].theta, noisy.model)
             worst, unsteady = tails.worst(everywhere[0].rows, errors), (float(np.median(noisy.sigma)), noisy.memory_s)
-            ladder = replace(ladder, worst=worst, unsteady=unsteady, agreement=agreements["scene"])
-            ladder = replace(ladder, tails=agreements["tails"], sizes=agreements["sizes"], past=agreements["past"])
-            ladder = replace(ladder, leading=agreements.get("leading"))
+            ladder = replace(ladder, worst=worst, unsteady=unsteady, agreement=agree["scene"], tails=agree["tails"])
+            ladder = replace(ladder, sizes=agree["sizes"], past=agree["past"], leading=agree.get("leading"))
         judgement = replace(judgement, ladder=ladder)
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
     limits = ceilings.ceilings_of(decided.null_in_closed_loop, scored, null, decided.rounds[0].smooth_gain)

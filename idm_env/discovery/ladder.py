@@ -39,8 +39,8 @@ The scene tells a part of drivers' noise, too: of six sets without an effect, no
 
 FORESEEN = 0.2
 """Share foreseen by other errors: 0.10 to 0.13 in generated sets with noise of 0.1 and 0.2 m/s², 0.5 if T wanders."""
-TAILS, ALIKE = 0.03, 0.2
-"""p-value below which errors lie together (one of 39 replicas is not), and from which on noise looks like them."""
+LEVEL, ALIKE = 0.05, 0.2
+"""p-value below which all tests together say that something is missing, and from which on noise looks like errors."""
 
 
 @dataclass(frozen=True)
@@ -48,17 +48,19 @@ class Agreement:
     """Whether errors 5 s ahead look like what drivers' and sensors' noise leave: see ``replica.agreement``.
 
     ``share`` of the squared error is what something takes from drivers fitted to the very windows, and ``p_value`` is
-    how often it takes as much in ``replicas`` in which nothing is missing.
+    how often it takes as much in ``replicas`` in which nothing is missing. Below ``level`` noise leaves so much hardly
+    ever: tests that are asked together share ``LEVEL``.
     """
 
     share: float
     p_value: float
     replicas: int
+    level: float = LEVEL
 
     @property
     def is_refused(self) -> bool:
         """Whether noise leaves so much hardly ever."""
-        return self.p_value < 0.05
+        return self.p_value < self.level
 
 
 @dataclass(frozen=True)
@@ -125,11 +127,6 @@ class Ladder:
         return sure if sure > STRUCTURED else 0.0
 
     @property
-    def is_somewhere(self) -> bool:
-        """Whether errors lie together as noise hardly ever makes them."""
-        return self.tails is not None and self.tails.p_value < TAILS
-
-    @property
     def agrees(self) -> bool:
         """Whether noise of drivers looks like the errors in every test, and not only unlike them in none.
 
@@ -139,11 +136,6 @@ class Ladder:
         return all(
             one is not None and (one.p_value >= ALIKE or (one is self.past and one.share < FORESEEN)) for one in tests
         )
-
-    @property
-    def leads(self) -> bool:
-        """Whether the leading candidate gains what noise hardly ever makes; True where that was not asked."""
-        return self.leading is None or self.leading.is_refused
 
 
 def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, floor_m: float, seed: int) -> Ladder:
@@ -204,15 +196,15 @@ def _crps(rows: Rows, error: np.ndarray) -> float:
     return float(np.mean(wide * (z * (2.0 * normal.cdf(z) - 1.0) + 2.0 * normal.pdf(z) - np.pi**-0.5)))
 
 
-def followed(rows: Rows, error: np.ndarray) -> Share:
-    """Return the share of squared errors [W] that a driver's other errors foresee, and its interval."""
-    return _share(rows, error, _beside_drift(rows, error), error)
+def followed(rows: Rows, error: np.ndarray) -> float:
+    """Return the share of squared errors [W] that a driver's other errors foresee."""
+    return _share(rows, error, _beside_drift(rows, error), error).share
 
 
-def structure(rows: Rows, error: np.ndarray, seed: int, features: int) -> Share:
-    """Return the share of squared errors [W] that a smooth function of the scene takes beside drift, and interval."""
+def structure(rows: Rows, error: np.ndarray, seed: int, features: int) -> float:
+    """Return the share of squared errors [W] that a smooth function of the scene takes beside drift."""
     rest = _beside_drift(rows, error)
-    return _share(rows, rest, rest - _smooth(rows, rest, _scene(rows), seed, features), error)
+    return _share(rows, rest, rest - _smooth(rows, rest, _scene(rows), seed, features), error).share
 
 
 def _smooth(rows: Rows, error: np.ndarray, points: np.ndarray, seed: int, features: int) -> np.ndarray:

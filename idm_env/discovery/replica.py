@@ -1,12 +1,13 @@
 """The same drivers once more: records as a calibrated model and its drivers' own noise would have made them.
 
-Noise of drivers is an Ornstein–Uhlenbeck acceleration, ``da = −a dt/τ + σ √(2/τ) dW``, matched to how errors of the
-speed grow in windows of 5 s. Every follower drives behind his measured leader. What a smooth function of the scene
+Noise of drivers is an Ornstein–Uhlenbeck acceleration, ``da = −a dt/τ + σ √(2/τ) dW``, matched to errors of the gap
+5 s ahead. Every follower drives behind his measured leader. What a smooth function of the scene
 tells of errors in them is what noise alone does: the scene has felt it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.signal import lfilter
@@ -18,24 +19,34 @@ from idm_env.discovery.ridge import by_group
 from idm_env.discovery.score import held_out, log_gain
 from idm_env.discovery.solve import Population, Problem, Solution, solve
 
-LAGS_S = (0.5, 1.5)
-"""Lags at which increments of the speed's error are compared: at these, white noise of sensors is gone."""
-MEMORIES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+FIRST_SIGMA = 0.1
+"""Noise (m/s²) of the median driver from which its size is sought."""
+MEMORIES_S = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Memories of drivers' noise that are tried."""
+ALIKE = 5
+"""Replicas in whose mean noise of a kind is held against the data."""
 DRAWS, ENOUGH = 39, 3
-"""Replicas at most, and how many that look as structured as the data end the drawing (Besag and Clifford 1991)."""
+"""Replicas for a likeness, and how many that look as structured as the data are enough (Besag and Clifford 1991)."""
+CLEAR, MOST = 99, 199
+"""Replicas after which none such is refusal enough, and replicas at most, of what claims that something is missing."""
 FEATURES = 40
 EMPTY = np.zeros((1, 0))
+Statistic = Callable[[Rows, np.ndarray], float]
+"""Of errors of the gap 5 s ahead [W]."""
 
 
 @dataclass(frozen=True, eq=False)
 class NoisyDrivers:
-    """A calibrated model: φ stands in ``model``, log θ [G, P]; noise of σ [G] (m/s²) with a memory of τ (s)."""
+    """A calibrated model: φ stands in ``model``, log θ [G, P]; noise of σ [G] (m/s²) with a memory of τ (s).
+
+    Noise ``by_speed`` grows in proportion to it, and has σ in the root mean square of a record.
+    """
 
     model: Hypothesis
     theta: np.ndarray
     sigma: np.ndarray
     memory_s: float
+    by_speed: bool = False
 
     def drive(self, records: Records, random: np.random.Generator, noise_m: float = 0.0) -> Records:
         """Return the records that these drivers would have made behind the same leaders, positions with white noise."""
@@ -45,8 +56,9 @@ class NoisyDrivers:
         for r, (first, end) in enumerate(zip(records.bounds[:-1], records.bounds[1:], strict=True)):
             fresh = random.standard_normal(end - first)
             fresh[1:] *= np.sqrt(1.0 - keep**2)
-            noise = lfilter([1.0], [1.0, -keep], fresh)
-            pushed[first:end] = self.sigma[records.group[r]] * noise
+            noise = self.sigma[records.group[r]] * lfilter([1.0], [1.0, -keep], fresh)
+            speed = np.maximum(records.speed[first:end], 0.0)
+            pushed[first:end] = noise * (speed / (np.sqrt(np.mean(speed**2)) + 0.1) if self.by_speed else 1.0)
         rows = whole(driven, longest_s=np.inf, every_s=0.0)
         pulse = np.array([[1.0, 0.0, rows.steps, 1.0]])
         problem = Problem(rows, None, _no_prior(self.theta))
@@ -64,33 +76,41 @@ class NoisyDrivers:
         return replace(driven)
 
 
-def drivers_of(problem: Problem, solution: Solution, noise_m: float) -> NoisyDrivers:
+def drivers_of(
+    problem: Problem, solution: Solution, noise_m: float, of_errors: Mapping[str, Statistic]
+) -> NoisyDrivers:
     """Return a calibrated model of windows with its drivers' noise: as records driven with it look most alike.
+
+    The memory is the one by which other errors of a driver foresee as much as in the data (``past``). Noise grows with
+    speed if the scene then tells as much of the errors' ``sizes``.
+    """
+    model, rows = solution.model.fixed(solution.values), problem.rows
+    sigma = FIRST_SIGMA * _shares(rows, model, solution.theta)
+
+    def unlike(name: str, drivers: NoisyDrivers) -> float:
+        random = np.random.default_rng(1)
+        replicas = [_fitted(problem, drivers, random, noise_m) for _ in range(ALIKE)]
+        shares = [of_errors[name](replica.rows, ahead(replica, theta, model)) for replica, theta in replicas]
+        return abs(float(np.mean(shares)) - of_errors[name](rows, ahead(problem, solution.theta, model)))
+
+    each = (NoisyDrivers(model, solution.theta, sigma, memory) for memory in MEMORIES_S)
+    best = min((_as_large(problem, solution, drivers, noise_m) for drivers in each), key=partial(unlike, "past"))
+    more = _as_large(problem, solution, replace(best, by_speed=True), noise_m)
+    return min((best, more), key=partial(unlike, "sizes"))
+
+
+def _as_large(problem: Problem, solution: Solution, drivers: NoisyDrivers, noise_m: float) -> NoisyDrivers:
+    """Return drivers whose errors 5 s ahead are as large as the data's.
 
     Noise makes drivers look as if they pulled less at their gaps: what changed a gap goes on. So θ is moved by as much
     as drivers fitted to a replica are off, in the mean of all.
     """
-    records, model = problem.rows.records, solution.model.fixed(solution.values)
-    near, far, of_group = _increments(problem.rows, model, solution.theta)
-    none = NoisyDrivers(model, solution.theta, np.zeros(problem.groups), MEMORIES_S[0])
-    if near <= 0.0:
-        return none
-    tried: list[tuple[float, NoisyDrivers]] = []
-    for memory in MEMORIES_S:
-        first = replace(none, sigma=np.sqrt(near * of_group) / LAGS_S[0], memory_s=memory)
-        driven = first.drive(records, np.random.default_rng(0))
-        sooner, later, _ = _increments(replace(problem.rows, records=driven), model, solution.theta)
-        if sooner > 0.0:
-            tried.append((abs(later / sooner - far / near), replace(first, sigma=first.sigma * np.sqrt(near / sooner))))
-    if not tried:
-        return none
-    best = min(tried, key=lambda one: one[0])[1]
+    model, best = drivers.model, drivers
     seen, goal = np.unique(problem.rows.group), np.median(ahead(problem, solution.theta, model) ** 2)
     low, high = model.catalogue.bounds.T
     for _ in range(2):
         replica, theta = _fitted(problem, best, np.random.default_rng(0), noise_m)
         off = np.median((theta - best.theta)[seen], axis=0)
-        # Increments tell what is drift and its memory; how large it is shows better in what it comes to.
         scale = np.sqrt(goal / np.median(ahead(replica, theta, model) ** 2))
         best = replace(best, theta=np.clip(solution.theta - off, low, high), sigma=best.sigma * scale)
     return best
@@ -110,21 +130,24 @@ def ahead(problem: Problem, theta: np.ndarray, model: Hypothesis) -> np.ndarray:
     return errors
 
 
-def _increments(rows: Rows, model: Hypothesis, theta: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Return the covariance of increments of the speed's error at both lags (m²/s²), and drivers' shares of it [G].
-
-    A driver counts by one over his own mean square plus the usual one.
-    """
+def _shares(rows: Rows, model: Hypothesis, theta: np.ndarray) -> np.ndarray:
+    """Return every driver's root mean square of increments of the speed's error over the median one [G]."""
     speed = Problem(rows, None, _no_prior(theta)).predict(theta[None], model, EMPTY)[1][0]
-    step = np.diff(speed - rows.records.speed[rows.samples], axis=1, prepend=0.0)
-    own = np.mean(step**2, axis=1)
+    own = np.mean(np.diff(speed - rows.records.speed[rows.samples], axis=1, prepend=0.0) ** 2, axis=1)
     square = np.bincount(rows.group, own, len(theta)) / np.maximum(np.bincount(rows.group, minlength=len(theta)), 1)
-    usual = float(np.median(square[square > 0.0])) if square.any() else 1.0
-    weight = usual / (square[rows.group] + usual)
-    lags = [max(1, round(s / (rows.every * rows.records.dt))) for s in LAGS_S]
-    near, far = (float(np.mean(weight * np.mean(step[:, :-lag] * step[:, lag:], axis=1))) for lag in lags)
-    total = float(np.mean(weight * square[rows.group]))
-    return near / total * usual, far / total * usual, square / usual
+    shares: np.ndarray = np.sqrt(square / np.median(square[square > 0.0]))
+    return shares
+
+
+def statistics(seed: int) -> dict[str, Statistic]:
+    """Return by name what ``agreement`` holds against replicas, with random features of a seed."""
+    scene = partial(ladder.structure, seed=seed, features=FEATURES)
+
+    def sizes(rows: Rows, error: np.ndarray) -> float:
+        size = np.abs(error)
+        return scene(rows, size / by_group(rows, size + tails.FLOOR_M) - 1.0)
+
+    return {"scene": scene, "tails": tails.concentration, "sizes": sizes, "past": ladder.followed}
 
 
 def agreement(
@@ -136,19 +159,11 @@ def agreement(
     beside drift. ``sizes``: what it tells of the errors' sizes, which even noise leaves alone. ``past``: what a
     driver's other errors take. ``tails``: what lies in the worst windows. ``leading``: what a ``term`` takes in
     whitened windows. Every replica has drivers' noise and that of sensors (``noise_m``). Drivers are fitted to it in
-    windows of 5 s, as those of ``solution`` are to the data.
+    windows of 5 s, as those of ``solution`` are to the data. Scene, tails and leading claim that something is missing:
+    together they may be wrong in 5 % (Bonferroni), and have more replicas until that is clear.
     """
-    drivers, random = drivers_of(problem, solution, noise_m), np.random.default_rng(seed)
-
-    def scene(rows: Rows, error: np.ndarray) -> float:
-        return ladder.structure(rows, error, seed, FEATURES).share
-
-    def past(rows: Rows, error: np.ndarray) -> float:
-        return ladder.followed(rows, error).share
-
-    def sizes(rows: Rows, error: np.ndarray) -> float:
-        size = np.abs(error)
-        return scene(rows, size / by_group(rows, size + tails.FLOOR_M) - 1.0)
+    of_errors, random = statistics(seed), np.random.default_rng(seed)
+    drivers = drivers_of(problem, solution, noise_m, of_errors)
 
     def gain(windowed: Problem, theta: np.ndarray) -> float:
         assert term is not None
@@ -158,23 +173,25 @@ def agreement(
         mean = float(log_gain(held_out(windowed, before), held_out(windowed, after)).mean())
         return 1.0 - float(np.exp(-2.0 * mean))
 
-    of_errors = {"scene": scene, "tails": tails.concentration, "sizes": sizes, "past": past}
-
     def told(windowed: Problem, theta: np.ndarray, names: Sequence[str]) -> dict[str, float]:
         error = ahead(windowed, theta, drivers.model)
         return {n: of_errors[n](windowed.rows, error) if n in of_errors else gain(windowed, theta) for n in names}
 
-    mine = told(problem, solution.theta, [*of_errors, *([] if term is None else ["leading"])])
+    claims = ["scene", "tails", *([] if term is None else ["leading"])]
+    mine = told(problem, solution.theta, [*of_errors, *claims[2:]])
     above, draws = dict.fromkeys(mine, 0), dict.fromkeys(mine, 0)
-    for draw in range(1, DRAWS + 1):
-        if not (still := [name for name in mine if above[name] < ENOUGH]):
+    for draw in range(1, MOST + 1):
+        still = [n for n in mine if above[n] < ENOUGH and (draw <= DRAWS or n in claims)]
+        # Of what is clearly refused no more is asked, and nothing else then: something is missing.
+        if not still or (draw > CLEAR and not all(above[n] for n in claims)):
             break
         replica, theta = _fitted(problem, drivers, random, noise_m)
         for name, value in told(replica, theta, still).items():
             above[name] += value >= mine[name]
             draws[name] = draw
     p = {name: a / draws[name] if a == ENOUGH else (a + 1) / (draws[name] + 1) for name, a in above.items()}
-    return drivers, {name: ladder.Agreement(mine[name], p[name], draws[name]) for name in mine}
+    level = dict.fromkeys(claims, ladder.LEVEL / len(claims))
+    return drivers, {n: ladder.Agreement(mine[n], p[n], draws[n], level.get(n, ladder.LEVEL)) for n in mine}
 
 
 def _no_prior(theta: np.ndarray) -> Population:

@@ -148,7 +148,7 @@ def _verdict(
     power = len(problem.rows.records.runs) >= MANY_RUNS or powerful(
         [s for s in strengths.values() if s.knots == 1], first.tested, smallest_p(counted.run)
     )
-    leads = first.leading is not None and (ladder is None or ladder.leads)
+    leads = first.leading is not None and (ladder is None or ladder.leading is None or ladder.leading.is_refused)
     structured = leads or any(r.leading is not None for r in rounds if r.in_closed_loop)
     unnamed = 0.0 if ladder is None else ladder.unnamed
     verdict = conclude(
@@ -175,7 +175,7 @@ def unsure(ladder: Ladder | None, refusal: Refusal) -> tuple[Verdict, Refusal]:
 
     Noise of drivers explains them where it looks like them in every test; an effect of an unknown form does, too.
     """
-    if ladder is not None and ladder.is_somewhere:
+    if ladder is not None and ladder.tails is not None and ladder.tails.is_refused:
         return Verdict.UNEXPLAINED, Refusal(Reason.TAILS)
     return Verdict.NONE if ladder is not None and ladder.agrees else Verdict.UNDECIDED, refusal
 

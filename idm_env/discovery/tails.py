@@ -42,11 +42,10 @@ def worst(rows: Rows, error: np.ndarray) -> Worst | None:
     """Return the condition that is commoner in the windows with the largest errors [W] than in all, or None."""
     relative, records, dt = _relative(rows, error), rows.records, rows.records.dt
     largest = relative >= np.quantile(relative, 1.0 - WORST)
-    inside = rows.start[:, None] + np.arange(0, rows.steps, max(1, round(0.5 / dt)))
-    past = np.maximum(
-        rows.start[:, None] - np.arange(0, round(BEFORE_S / dt), max(1, round(0.5 / dt))),
-        records.bounds[rows.record][:, None],
-    )
+    half = max(1, round(0.5 / dt))
+    inside = rows.start[:, None] + np.arange(0, rows.steps, half)
+    before = rows.start[:, None] - np.arange(0, round(BEFORE_S / dt), half)
+    past = np.maximum(before, records.bounds[rows.record][:, None])
     leader, speed, own = records.column("lead_accel"), records.speed, records.column("accel")
     conditions = {
         "after a stop": speed[past].min(1) < 1.0,

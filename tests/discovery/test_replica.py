@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from idm_env.data import episodes, hidden, synthetic
+from benchmarks import undeclared
+from idm_env.data import Trajectories, episodes, hidden, synthetic
 from idm_env.discovery import judge, replica
 from idm_env.discovery.calibrate import first_prior
-from idm_env.discovery.ladder import FORESEEN
+from idm_env.discovery.ladder import FORESEEN, LEVEL
 from idm_env.discovery.model import Hypothesis, curve, simple
 from idm_env.discovery.noise import first_noise
 from idm_env.discovery.records import gather, windows
@@ -20,7 +21,11 @@ from idm_env.jobs.storage import Store
 
 def fitted(seed: int, ou: float, runs: int = 8, seconds: float = 120.0) -> tuple[Problem, Solution]:
     """Return the windows of three drivers in every run, with noise, and drivers of IDM fitted to them."""
-    made, _ = synthetic.generate(seed, runs=runs, followers=3, seconds=seconds, ou=ou)
+    return fitted_to(synthetic.generate(seed, runs=runs, followers=3, seconds=seconds, ou=ou)[0])
+
+
+def fitted_to(made: Trajectories) -> tuple[Problem, Solution]:
+    """Return the windows of trajectories, and drivers of IDM fitted to them."""
     records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     rows = windows(records)
     problem = Problem(rows, first_noise(rows), first_prior())
@@ -37,10 +42,9 @@ def floor_of(problem: Problem) -> float:
 def test_noise_of_drivers_is_that_of_the_data_and_what_it_leaves_agrees(ou: float) -> None:
     """An Ornstein–Uhlenbeck acceleration of 0.1 m/s² whose memory is 5 s."""
     problem, found = fitted(4, ou)
-    drivers = replica.drivers_of(problem, found, floor_of(problem))
+    drivers, told = replica.agreement(problem, found, floor_of(problem), 0)
     assert np.median(drivers.sigma) == pytest.approx(ou, abs=0.02)
     assert not ou or 2.0 <= drivers.memory_s <= 8.0
-    _, told = replica.agreement(problem, found, floor_of(problem), 0)
     assert told.pop("past").share < FORESEEN
     for one in told.values():
         assert not one.is_refused and one.p_value >= 0.05 and one.replicas >= replica.ENOUGH
@@ -63,4 +67,15 @@ def test_what_drivers_do_in_a_state_is_no_noise(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(hidden, "_desired_gap", doubled)
     _, told = replica.agreement(*fitted(4, 0.1), 0.05, 0, curve("time_gap", "closing_speed", -3.0, 1.0, 8))
     for one in (told["scene"], told["leading"]):
-        assert one.is_refused and one.replicas == replica.DRAWS and one.share > 0.02
+        assert one.is_refused and one.replicas == replica.CLEAR and one.share > 0.02
+    claims = [told[name].level for name in ("scene", "tails", "leading")]
+    assert sum(claims) == pytest.approx(LEVEL) and min(claims) > 1.0 / (1.0 + replica.CLEAR)
+
+
+@pytest.mark.parametrize(("kind", "ou", "seed"), [("OU 0.2", 0.2, 970_201), ("noise by speed", 0.0, 970_402)])
+def test_sets_in_which_nothing_is_missing_say_so(kind: str, ou: float, seed: int) -> None:
+    """Both were refused with p = 0.025, the least of 39 replicas whose noise was too short, or as large everywhere."""
+    problem, found = fitted_to(undeclared.generated(undeclared.Job(kind, ou, seed)))
+    drivers, told = replica.agreement(problem, found, floor_of(problem), seed)
+    assert drivers.by_speed == (kind == "noise by speed") and drivers.memory_s == 4.0
+    assert not any(one.is_refused for one in told.values())

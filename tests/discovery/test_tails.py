@@ -33,8 +33,7 @@ def told(p_scene: float, p_tails: float, p_sizes: float = 0.5, foreseen: float =
         agreement=Agreement(0.01, p_scene, 39), tails=Agreement(0.42, p_tails, 39), worst=worst, unsteady=(0.21, 4.0),
         sizes=Agreement(0.1, p_sizes, 39), past=Agreement(foreseen, 0.025, 39),
     )  # fmt: skip
-    for name in ("is_somewhere", "agrees"):
-        setattr(made, name, getattr(Ladder, name).fget(made))
+    made.agrees = Ladder.agrees.fget(made)  # type: ignore[attr-defined]
     return made  # type: ignore[return-value]
 
 
@@ -52,7 +51,7 @@ def told(p_scene: float, p_tails: float, p_sizes: float = 0.5, foreseen: float =
 )
 def test_absence_is_a_claim_of_its_own(ladder_: Ladder | None, verdict: Verdict) -> None:
     """Over errors of 44 times the sensors' noise nothing is missing only where noise of drivers looks like them."""
-    assert ladder.ALIKE > ladder.TAILS
+    assert ladder.ALIKE > ladder.LEVEL
     found, refusal = unsure(ladder_, Refusal(Reason.NO_GAIN))
     assert found is verdict and (refusal.reason is Reason.TAILS) == (verdict is Verdict.UNEXPLAINED)
     text = words.beside_noise(found, "IDM", 4.4, 0.1, ladder_)
