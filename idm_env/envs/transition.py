@@ -309,7 +309,8 @@ class CompiledTransition:
         begins = moment.begins = self.begins(moment, now, later)
         clock = {"clock": later.clock_at}
         moment.given = self.moving(moment) if stays else self.pointers(moment) | clock
-        _, where = bound.once.laid(begins, lambda: (self.pointers(moment) | clock, *begins), moment.given)
+        key = begins if stays else None
+        _, where = bound.once.laid(key, lambda: (self.pointers(moment) | clock, *begins), moment.given)
         self.split(bound.recorded.forward, where)
         self.refuse_nan(later.blocks)
         return bound.room.arrays

@@ -111,8 +111,9 @@ class RowTable:
         """Return the addresses for one call, or for some, and where they lie, until the next call.
 
         ``lay`` returns what ``filled`` takes; a ``key`` is laid out once, and later only what is ``moving`` is put in.
+        Without a key all is laid out anew.
         """
-        if key not in self._laid:
+        if key is None or key not in self._laid:
             if len(self._laid) >= 128:
                 self._laid.clear()
             cells = self.filled(*lay())
