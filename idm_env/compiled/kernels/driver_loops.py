@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from idm_env.compiled.kernels.memory import add, copy
 from idm_env.compiled.kernels.phases import call, call_beside
 from idm_env.compiled.kernels.tiles import exact, padded
 
@@ -60,22 +61,6 @@ def place(tile, rows, copies):
 
 
 @exact
-def get(w, at, source, n):
-    """Fill a row of the workspace."""
-    target = w[at:]
-    for j in range(n):
-        target[j] = source[j]
-
-
-@exact
-def put(target, w, at, n):
-    """Copy a row of the workspace."""
-    source = w[at:]
-    for j in range(n):
-        target[j] = source[j]
-
-
-@exact
 def clear_rows(w, at, rows, distance, n):
     """Zero rows of the workspace, or of the past."""
     for i in range(rows):
@@ -85,20 +70,12 @@ def clear_rows(w, at, rows, distance, n):
 
 
 @exact
-def add(w, to, source, n):
-    """Add to a row of the workspace."""
-    target = w[to:]
-    for j in range(n):
-        target[j] += source[j]
-
-
-@exact
 def begin_tile(w, plan, phases, start, statics, k, flat, n):
     """Load states and what holds for the rollout."""
     for i in range(plan.n_statics):
-        get(w, plan.statics + i * ROW, statics[i, flat:], n)
+        copy(w, plan.statics + i * ROW, statics[i, flat:], 0, n)
     for i in range(plan.n_states):
-        get(w, plan.states + i * ROW, start[i, flat:], n)
+        copy(w, plan.states + i * ROW, start[i, flat:], 0, n)
     if phases[HOIST]:
         call(phases[HOIST], w, padded(n), k)  # type: ignore[call-arg]
 
@@ -110,7 +87,7 @@ def load_record(w, plan, record, reads, t, row, n, repeats):
     for i in range(plan.n_records):
         source = record[reads[i, 0], t + reads[i, 1], row:]
         for c in range(repeats):
-            get(w, plan.records + i * ROW + c * many, source, many)
+            copy(w, plan.records + i * ROW + c * many, source, 0, many)
 
 
 # -- the past ----------------------------------------------------------------------------------------------------
@@ -121,21 +98,21 @@ def load_past(h, past, slots, signals, flat, wide, n):
     """Fill the window before the first step."""
     for s in range(slots):
         for i in range(signals):
-            get(h, ((slots - 1 - s) * signals + i) * wide, past[s * signals + i, flat:], n)
+            copy(h, ((slots - 1 - s) * signals + i) * wide, past[s * signals + i, flat:], 0, n)
 
 
 @exact
 def turn(h, slots, signals, wide, n):
     """Move the window on the past a block ahead."""
     for i in range(slots * signals):
-        put(h[i * wide :], h, (i + BLOCK * signals) * wide, n)
+        copy(h, i * wide, h, (i + BLOCK * signals) * wide, n)
 
 
 @exact
 def turn_back(ah, slots, signals, wide, n):
     """Move what fell on the steps before a block to the end of the block before it."""
     for i in range(slots * signals - 1, -1, -1):
-        put(ah[(i + BLOCK * signals) * wide :], ah, i * wide, n)
+        copy(ah, (i + BLOCK * signals) * wide, ah, i * wide, n)
     clear_rows(ah, 0, BLOCK * signals, wide, n)
 
 
@@ -172,7 +149,7 @@ def sense(w, h, plan, phases, k, now, wide, n):
     """Keep what drivers see now."""
     call(phases[SENSE], w, padded(n), k)  # type: ignore[call-arg]
     for i in range(plan.n_signals):
-        put(h[(now * plan.n_signals + i) * wide :], w, plan.signals + i * ROW, n)
+        copy(h, (now * plan.n_signals + i) * wide, w, plan.signals + i * ROW, n)
 
 
 # -- values ------------------------------------------------------------------------------------------------------
@@ -197,14 +174,14 @@ def forward(
                 turn(h, slots, plan.n_signals, wide, n)
             load_record(w, plan, record, reads, t, row, n, repeats)
             for i in range(len(taped)):
-                put(tape[i, t, flat:], w, plan.states + taped[i] * ROW, n)
+                copy(tape[i, t, flat:], 0, w, plan.states + taped[i] * ROW, n)
             if phases[SENSE]:
                 sense(w, h, plan, phases, k, now, wide, n)
                 look(w, plan.past, h, w, plan, seen, same, plan.n_signals, places, now, wide, n)
             call(phases[RESPOND], w, padded(n), k)  # type: ignore[call-arg]
             if (t + 1) % every == 0:
-                put(gap[t // every, flat:], w, plan.states, n)
-                put(speed[t // every, flat:], w, plan.states + ROW, n)
+                copy(gap[t // every, flat:], 0, w, plan.states, n)
+                copy(speed[t // every, flat:], 0, w, plan.states + ROW, n)
 
 
 # -- tangents ----------------------------------------------------------------------------------------------------
@@ -223,7 +200,7 @@ def carry(w, h, th, plan, phases, seen, same, places, moving, k, now, wide, n):
             past = th[p * size :]
             call_beside(phases[CARRY_SENSE], w, block, m, k)  # type: ignore[call-arg]
             for i in range(many):
-                put(past[(now * many + i) * wide :], block, plan.tangent_signals + i * ROW, n)
+                copy(past, (now * many + i) * wide, block, plan.tangent_signals + i * ROW, n)
             look(block, plan.tangent_past, past, w, plan, seen, same, many, moving, now, wide, n)
         call_beside(phases[CARRY], w, block, m, k)  # type: ignore[call-arg]
 
@@ -238,7 +215,7 @@ def begin_tangents(w, th, plan, phases, start_by, k, slots, flat, wide, n):
     if start_by.shape[0]:
         for p in range(plan.n_blocks):
             for i in range(plan.n_moving):
-                get(w, plan.blocks + p * plan.block + i * ROW, start_by[p, i, flat:], n)
+                copy(w, plan.blocks + p * plan.block + i * ROW, start_by[p, i, flat:], 0, n)
     if phases[FIX]:
         call(phases[FIX], w, padded(n), k)  # type: ignore[call-arg]
 
@@ -280,11 +257,11 @@ def sensitivities(
                 w, h, th, plan, phases, seen, same, places, moving, record, reads, k, t, slots, row, wide, n, repeats
             )
             if (t + 1) % every == 0:
-                put(gap[t // every, flat:], w, plan.states, n)
-                put(speed[t // every, flat:], w, plan.states + ROW, n)
+                copy(gap[t // every, flat:], 0, w, plan.states, n)
+                copy(speed[t // every, flat:], 0, w, plan.states + ROW, n)
                 for p in range(plan.n_blocks):
-                    put(gap_by[t // every, p, flat:], w, plan.blocks + p * plan.block, n)
-                    put(speed_by[t // every, p, flat:], w, plan.blocks + p * plan.block + ROW, n)
+                    copy(gap_by[t // every, p, flat:], 0, w, plan.blocks + p * plan.block, n)
+                    copy(speed_by[t // every, p, flat:], 0, w, plan.blocks + p * plan.block + ROW, n)
 
 
 @exact
@@ -321,7 +298,7 @@ def load_measured(row_of, source, row, n, repeats):
     """Load targets or weights of a sample, once per copy."""
     many = n // repeats
     for c in range(repeats):
-        get(row_of, c * many, source[row:], many)
+        copy(row_of, c * many, source, row, many)
 
 
 @exact
@@ -360,11 +337,11 @@ def normal_equations(
                         load_measured(weight, weights[state, t // every], row, n, repeats)
                         weigh(w, plan.states + state * ROW, target, weight, scaled, square, sums, n)
                         project(w, state, plan, scaled, square, part, gradients, normals, n)
-        put(cost[flat:], sums, 0, n)
+        copy(cost, flat, sums, 0, n)
         for p in range(plan.n_blocks):
-            put(gradient[p, flat:], gradients[p], 0, n)
+            copy(gradient[p, flat:], 0, gradients[p], 0, n)
         for q in range(pairs):
-            put(normal[q, flat:], normals[q], 0, n)
+            copy(normal[q, flat:], 0, normals[q], 0, n)
 
 
 # -- adjoint -----------------------------------------------------------------------------------------------------
@@ -374,7 +351,7 @@ def normal_equations(
 def load_step(w, plan, tape, taped, record, reads, t, flat, row, n, repeats):
     """Load states before step ``t``, and the record."""
     for i in range(len(taped)):
-        get(w, plan.states + taped[i] * ROW, tape[i, t, flat:], n)
+        copy(w, plan.states + taped[i] * ROW, tape[i, t, flat:], 0, n)
     load_record(w, plan, record, reads, t, row, n, repeats)
 
 
@@ -387,7 +364,7 @@ def past_again(
         now = slots + t - first
         if t < 0:
             for i in range(plan.n_signals):
-                get(h, (now * plan.n_signals + i) * wide, past[(-t - 1) * plan.n_signals + i, flat:], n)
+                copy(h, (now * plan.n_signals + i) * wide, past[(-t - 1) * plan.n_signals + i, flat:], 0, n)
         else:
             load_step(w, plan, tape, taped, record, reads, t, flat, row, n, repeats)
             sense(w, h, plan, phases, k, now, wide, n)
@@ -441,25 +418,25 @@ def adjoint(
                 load_step(w, plan, tape, taped, record, reads, t, flat, row, n, repeats)
                 if (t + 1) % every == 0:
                     if len(on_gap):
-                        add(w, plan.on_states, on_gap[t // every, flat:], n)
+                        add(w, plan.on_states, on_gap[t // every, flat:], 0, n)
                     if len(on_speed):
-                        add(w, plan.on_states + ROW, on_speed[t // every, flat:], n)
+                        add(w, plan.on_states + ROW, on_speed[t // every, flat:], 0, n)
                 if signals:
                     look(w, plan.past, h, w, plan, seen, same, signals, places, now, wide, n)
                 call(back[RESPOND], w, m, k)  # type: ignore[call-arg]
                 if signals:
                     fall(w, ah, plan, seen, same, places, now, wide, n)
                     for i in range(signals):
-                        get(w, plan.on_signals + i * ROW, ah[(now * signals + i) * wide :], n)
+                        copy(w, plan.on_signals + i * ROW, ah, (now * signals + i) * wide, n)
                     call(back[SENSE], w, m, k)  # type: ignore[call-arg]
             if signals and first:
                 turn_back(ah, slots, signals, wide, n)
         if back[HOIST]:
             call(back[HOIST], w, m, k)  # type: ignore[call-arg]
         for i in range(plan.n_moving):
-            put(on_start[i, flat:], w, plan.on_states + i * ROW, n)
+            copy(on_start[i, flat:], 0, w, plan.on_states + i * ROW, n)
         for s in range(slots):
             for i in range(signals):
-                put(on_past[s * signals + i, flat:], ah, ((slots - 1 - s) * signals + i) * wide, n)
+                copy(on_past[s * signals + i, flat:], 0, ah, ((slots - 1 - s) * signals + i) * wide, n)
         for i in range(plan.n_parameters):
-            put(on_statics[i, flat:], w, plan.on_parameters + i * ROW, n)
+            copy(on_statics[i, flat:], 0, w, plan.on_parameters + i * ROW, n)

@@ -7,8 +7,7 @@ simulated, all others are records. Time comes first, then drivers. Needs numba: 
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any
@@ -20,18 +19,17 @@ from torch.autograd.function import once_differentiable
 
 from idm_env.compiled.kernels import driver_loops as loops, threads as pool
 from idm_env.compiled.kernels.lanes import part_of
-from idm_env.compiled.kernels.printed import HEADER
+from idm_env.compiled.kernels.printed import HEADER, printed
 from idm_env.compiled.kernels.tiles import Array
 from idm_env.compiled.kernels.workspace import take
 from idm_env.compiled.scalar import library
 from idm_env.compiled.scalar.driver import DriverProgram, shift_of
 from idm_env.compiled.scalar.driver_text import ADJOINT, TANGENTS, VALUES, DriverText, RowLayout
 from idm_env.compiled.scalar.graph import Leaf, inputs_of
-from idm_env.compiled.scalar.record import Form, Untraceable, record, slot_name
+from idm_env.compiled.scalar.record import Form, record, slot_name
 from idm_env.delay_buffer import PAST
-from idm_env.effects.base import Effect
-from idm_env.roads import Lane, Road
-from idm_env.step import CarFollowingStep, Integration
+from idm_env.roads import Lane
+from idm_env.step import CarFollowingStep
 from idm_env.types import Inputs, Params, Record, State
 
 BESIDE = """beside = emitted(types.void(REAL, REAL, types.int64, REAL), fastmath={"contract"})
@@ -106,22 +104,15 @@ class DriverKernel:
 
 
 @lru_cache(maxsize=256)
-def _kernel(
-    road: Road,
-    effects: tuple[Effect, ...],
-    dt: float,
-    integration: Integration,
-    form: Form,
-    fixed: tuple[tuple[Leaf, float], ...],
-) -> DriverKernel | str:
-    try:
-        recording = record(CarFollowingStep(road, effects, dt, integration), form)
-        program = DriverProgram(recording, dict(fixed))
-    except Untraceable as why:
-        warnings.warn(f"no compiled fit, the torch path runs instead: {why}.", stacklevel=2)
-        return str(why)
-    title = f"One driver behind a record, by {', '.join(e.name for e in effects)}, {integration}."
-    return DriverKernel(program, title)
+def _made_for(fixed: tuple[tuple[Leaf, float], ...]) -> Callable[[CarFollowingStep, Form], DriverKernel]:
+    """Return what prints the step of one driver; some slots have one value always."""
+
+    def made(simulator: CarFollowingStep, form: Form) -> DriverKernel:
+        names = ", ".join(e.name for e in simulator.effects)
+        title = f"One driver behind a record, by {names}, {simulator.integration}."
+        return DriverKernel(DriverProgram(record(simulator, form), dict(fixed)), title)
+
+    return made
 
 
 def prepared(
@@ -149,12 +140,7 @@ def prepared(
                 return "some neighbour is no record"
             if value.present is not None and bool((value.present[..., driver] == 1).all()):
                 fixed |= {Leaf("present"): 1.0, Leaf(slot_name(effect, "present")): 1.0}
-    try:
-        kernel = _kernel(
-            simulator.road, simulator.effects, simulator.dt, simulator.integration, form, tuple(fixed.items())
-        )
-    except TypeError as error:  # an effect with a choice that cannot be hashed
-        return f"an effect cannot be a key: {error}"
+    kernel = printed(_made_for(tuple(fixed.items())), simulator, form, "no compiled fit, the torch path runs instead")
     return kernel if isinstance(kernel, str) else BehindRecord(kernel, records, inputs, driver)
 
 
