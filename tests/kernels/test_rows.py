@@ -33,11 +33,15 @@ def called(loops, arrays, rows=ROWS):
 def test_rows_of_any_length_and_their_adjoint_are_torchs(size):
     def around(x):
         ahead = torch.cat((x[:, -1:], x[:, :-1]), dim=-1)
-        return {"y": torch.where(ahead > x, ahead / x, x * x - ahead), "total": (x[:, 1:] * x[:, :-1]).sum(-1)}
+        return {
+            "y": torch.where(ahead > x, ahead / x, x * x - ahead),
+            "total": (x[:, 1:] * x[:, :-1]).sum(-1),
+            "soft": x.sigmoid(),
+        }
 
     x = torch.rand(MANY, size, dtype=torch.float64) + 0.5
     seeds = {f"on_{n}": torch.rand_like(v) for n, v in around(x).items()}
-    back = adjoint(around, ["y", "total"], ["x"])
+    back = adjoint(around, ["y", "total", "soft"], ["x"])
 
     def pulled(**leaves):
         return {"to_x": back(**leaves)["x"]}

@@ -64,7 +64,6 @@ _SIMPLER: dict[str, Callable[..., Any]] = {
     "elu_backward": _elu_back,
     "silu": lambda x: x * torch.sigmoid(x),
     "silu_backward": _silu_back,
-    "sigmoid_backward": lambda g, y: g * (1.0 - y) * y,
     "native_layer_norm": _layer_norm,
     "native_layer_norm_backward": _layer_norm_back,
 }
@@ -83,14 +82,14 @@ class PolicyRows(RowFunction):
     options = ', fastmath={"contract", "reassoc"}'
     imports = (
         f"{RowFunction.imports}from idm_env.compiled.kernels.dense import dense, outer\n"
-        "from idm_env.compiled.kernels.functions import exp_{kind} as exp, sigmoid_{kind} as sigmoid\n"
+        "from idm_env.compiled.kernels.functions import exp_{kind} as exp\n"
     )
     around = (
         f"    for first in range(begin, end, {PITCH}):\n"
         f"        count = min({PITCH}, end - first)\n"
         f"        m = (count + {ROWS - 1}) // {ROWS} * {ROWS}\n"
     )
-    unary = {**UNARY, "exp": "exp({0})", "sigmoid": "sigmoid({0})"}  # noqa: RUF012
+    unary = {**UNARY, "exp": "exp({0})"}  # noqa: RUF012
     simpler, lean = _SIMPLER, False
 
     def __init__(

@@ -94,6 +94,7 @@ SIMPLER: dict[str, Callable[..., Any]] = {
     "index_add": _index_added,
     "stack": lambda parts, dim=0: torch.cat([x.unsqueeze(dim) for x in parts], dim),
     "select_backward": _select_back,
+    "sigmoid_backward": lambda on, y: on * (1.0 - y) * y,
 }
 """What one operation is in terms of simpler ones."""
 
@@ -148,7 +149,7 @@ class RowFunction:
     """
 
     options, unary = "", UNARY
-    imports = "from idm_env.compiled.kernels.functions import tanh_{kind} as tanh\n"
+    imports = "from idm_env.compiled.kernels.functions import sigmoid_{kind} as sigmoid, tanh_{kind} as tanh\n"
     """How it is compiled, what is imported for that, and operations on single numbers."""
     around = "    for r in range(begin, end):\n"
     """The loop over rows."""
@@ -448,7 +449,7 @@ class RowFunction:
         if name == "copy":
             name, args = "clone", args[1:]
         if name in self.unary or name in ("_to_copy", "clone"):
-            form = "np.tanh({0})" if name == "tanh" and to.kind == "d" else self.unary.get(name, "{0}")
+            form = self.unary.get(f"{name}{' of doubles' if to.kind == 'd' else ''}") or self.unary.get(name, "{0}")
             kind = None if name == "isinf" else to.kind
             return self._each(to, shape, lambda cell: form.format(self._at(args[0], cell, kind)))
         if name in BINARY or name in COMPARE:
