@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels.operands import gradients
 from idm_env.compiled.kernels.reads import Reads
 from idm_env.compiled.scalar.record import Unordered, Untraceable
 from idm_env.delay_buffer import PAST
@@ -287,11 +288,11 @@ class _Step(torch.autograd.Function):
         past = None if on_past is None else on_past.contiguous().numpy()
         on_now, on_action, on_parameters, before = plan.back(moment, seeds, later, past)
         shape = blocks.shape
-        gradients = [torch.from_numpy(on_now).view(shape), None if on_action is None else torch.from_numpy(on_action)]
-        gradients.append(None if token is None else torch.from_numpy(before))
+        slopes = [torch.from_numpy(on_now).view(shape), None if on_action is None else torch.from_numpy(on_action)]
+        slopes.append(None if token is None else torch.from_numpy(before))
         for i, x in moment.bound.wanted:
-            gradients.append(torch.from_numpy(on_parameters[i]).view(shape[1:]).sum_to_size(x.shape).to(x.dtype))
-        return (None,) * 4 + tuple(gradients)
+            slopes.append(torch.from_numpy(on_parameters[i]).view(shape[1:]).sum_to_size(x.shape).to(x.dtype))
+        return (None,) * 4 + tuple(slopes)
 
 
 def _twice(
@@ -313,13 +314,7 @@ def _twice(
     last = after.state.memory.get(PAST)
     outputs = [_block(after, layout.blocks), None if last is None else last.movedim(1, -1)]
     outputs += [outcome[n] for n in recorded.flowing]
-    pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if o is not None and s is not None and o.requires_grad]
-    every = blocks, action, token, *parameters
-    differentiated = [x is not None and x.requires_grad for x in every]
-    sources: list[Any] = [x for x, flows in zip(every, differentiated, strict=True) if flows]
-    results, falls = zip(*pairs, strict=True)
-    gradients = iter(torch.autograd.grad(results, sources, falls, create_graph=True, allow_unused=True))
-    return tuple(next(gradients) if flows else None for flows in differentiated)
+    return gradients(outputs, seeds, (blocks, action, token, *parameters))
 
 
 def _world(

@@ -104,15 +104,15 @@ class DriverKernel:
 
 
 @lru_cache(maxsize=256)
-def _made_for(fixed: tuple[tuple[Leaf, float], ...]) -> Callable[[CarFollowingStep, Form], DriverKernel]:
+def _printer(fixed: tuple[tuple[Leaf, float], ...]) -> Callable[[CarFollowingStep, Form], DriverKernel]:
     """Return what prints the step of one driver; some slots have one value always."""
 
-    def made(simulator: CarFollowingStep, form: Form) -> DriverKernel:
+    def kernel(simulator: CarFollowingStep, form: Form) -> DriverKernel:
         names = ", ".join(e.name for e in simulator.effects)
         title = f"One driver behind a record, by {names}, {simulator.integration}."
         return DriverKernel(DriverProgram(record(simulator, form), dict(fixed)), title)
 
-    return made
+    return kernel
 
 
 def prepared(
@@ -140,7 +140,7 @@ def prepared(
                 return "some neighbour is no record"
             if value.present is not None and bool((value.present[..., driver] == 1).all()):
                 fixed |= {Leaf("present"): 1.0, Leaf(slot_name(effect, "present")): 1.0}
-    kernel = printed(_made_for(tuple(fixed.items())), simulator, form, "no compiled fit, the torch path runs instead")
+    kernel = printed(_printer(tuple(fixed.items())), simulator, form, "no compiled fit, the torch path runs instead")
     return kernel if isinstance(kernel, str) else BehindRecord(kernel, records, inputs, driver)
 
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from idm_env.backends import off
 from idm_env.compiled.kernels import lane_adjoint, lane_loops, threads as pool, tiles
 from idm_env.compiled.kernels.memory import addresses
-from idm_env.compiled.kernels.operands import dense, operand, reduced, table
+from idm_env.compiled.kernels.operands import dense, gradients, operand, reduced, table
 from idm_env.compiled.kernels.printed import TileKernel
 from idm_env.compiled.kernels.tiles import Array
 from idm_env.compiled.kernels.workspace import take
@@ -342,7 +342,7 @@ def _timed(gradient: Array, plan: RolloutPlan, like: Tensor) -> Tensor:
 
 def _differentiable(
     plan: RolloutPlan, saved: tuple[Tensor, ...], seeds: tuple[Tensor | None, ...]
-) -> list[Tensor | None]:
+) -> tuple[Tensor | None, ...]:
     """Return the gradients with a graph of their own, for second derivatives, from the torch path."""
     program = plan.kernel.program
     values = dict(zip(program.moving, saved, strict=False))
@@ -360,12 +360,7 @@ def _differentiable(
         *([last.memory[PAST]] if plan.slots else []),
         *(motion if plan.keep else ()),
     ]
-    pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if s is not None]
-    leaves = [x for x in saved if x.requires_grad]
-    gradients = iter(
-        torch.autograd.grad([o for o, _ in pairs], leaves, [s for _, s in pairs], create_graph=True, allow_unused=True)
-    )
-    return [next(gradients) if x.requires_grad else None for x in saved]
+    return gradients(outputs, seeds, saved)
 
 
 def rollout(

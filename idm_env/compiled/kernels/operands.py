@@ -73,6 +73,20 @@ def reduced(gradient: Array, full: Sequence[int], like: Tensor) -> Tensor:
     return torch.from_numpy(gradient).view(*full).sum_to_size(like.shape)
 
 
+def gradients(
+    outputs: Sequence[Tensor | None], seeds: Sequence[Tensor | None], sources: Sequence[Tensor | None]
+) -> tuple[Tensor | None, ...]:
+    """Return what falls on sources of any shape from ``seeds`` on outputs, by torch, with a graph of their own.
+
+    None where a source requires no gradient, or nothing falls on it.
+    """
+    pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if o is not None and s is not None and o.requires_grad]
+    leaves = [x for x in sources if x is not None and x.requires_grad]
+    results, falls = zip(*pairs, strict=True)
+    slopes = iter(torch.autograd.grad(results, leaves, falls, create_graph=True, allow_unused=True))
+    return tuple(next(slopes) if x is not None and x.requires_grad else None for x in sources)
+
+
 def table(strides: Sequence[Strides]) -> np.ndarray[Any, np.dtype[np.int64]]:
     """Return strides as the array that compiled loops read."""
     return np.array(strides, np.int64).reshape(-1, 3)
