@@ -9,22 +9,10 @@ import numpy as np
 
 from idm_env.data import Trajectories
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import (
-    bases,
-    ceilings,
-    fleet,
-    found,
-    judge,
-    model as terms,
-    places,
-    replica,
-    shared,
-    summary,
-    tails,
-)
+from idm_env.discovery import bases, ceilings, fleet, found, judge, places, replica, shared, summary, tails
 from idm_env.discovery.compare import compare
 from idm_env.discovery.judgement import Evaluation, Judgement, judgement_of
-from idm_env.discovery.model import Hypothesis
+from idm_env.discovery.model import Hypothesis, effects_of
 from idm_env.discovery.records import Records
 from idm_env.discovery.result import Result
 from idm_env.discovery.rolled import roll
@@ -102,7 +90,7 @@ def finished(
     if judgement.is_exact(least):
         judgement = replace(judgement, added=False, refusal=judgement.refusal or Refusal(Reason.SMALL_SIZE, least))
     elif laws:
-        evaluation, decided, judgement, last = _on_the_best(evaluation, decided, judgement, last, laws, searched)
+        evaluation, decided, judgement, last = _on_the_best((evaluation, decided, judgement, last), laws, searched)
         if evaluation.adapt and judgement.of_all is not None:
             judgement = judgement.split(fleet.found(laws, judgement.of_all, of_laws.among, evaluation.seed))
     null, prepared, problem = decided.null, evaluation.records, evaluation.searching.problem
@@ -141,19 +129,13 @@ def finished(
 Found = tuple[Evaluation, Decided, Judgement, Solution]
 
 
-def _on_the_best(
-    evaluation: Evaluation,
-    decided: Decided,
-    judgement: Judgement,
-    last: Solution,
-    laws: list[bases.Law],
-    searched: Searched,
-) -> Found:
+def _on_the_best(before: Found, laws: list[bases.Law], searched: Searched) -> Found:
     """Return what is found on the best law where that is another one, if it is better than all that was found before.
 
     It has to hold by the rules of every addition, against its law, and against the law or IDM with what was added. On a
     law that errs more than IDM with what was added, nothing is sought.
     """
+    evaluation, decided, judgement, last = before
     best = bases.best_of(laws)
     now = judgement.beside(best)
     few = judgement.refusal is not None and judgement.refusal.reason is Reason.FEW_RUNS
@@ -212,7 +194,7 @@ def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) ->
 
     ``theta`` [G, P] is log θ of all groups, of which those of ``prepared`` are saved.
     """
-    added, numbers = terms.effects_of(final.model, final.values)
+    added, numbers = effects_of(final.model, final.values)
     # Effects that adapt a driver are chained as in discovery's loop.
     added.sort(key=lambda e: e.rank if e.hook == "adapt" else 0)
     seen = np.unique(prepared.group)

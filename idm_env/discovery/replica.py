@@ -87,16 +87,18 @@ def drivers_of(
     model, rows = solution.model.fixed(solution.values), problem.rows
     sigma = FIRST_SIGMA * _shares(rows, model, solution.theta)
 
-    def unlike(name: str, drivers: NoisyDrivers) -> float:
+    def mean_share(name: str, drivers: NoisyDrivers) -> float:
         random = np.random.default_rng(1)
         replicas = [_fitted(problem, drivers, random, noise_m) for _ in range(ALIKE)]
-        shares = [of_errors[name](replica.rows, ahead(replica, theta, model)) for replica, theta in replicas]
-        return abs(float(np.mean(shares)) - of_errors[name](rows, ahead(problem, solution.theta, model)))
+        return float(np.mean([of_errors[name](x.rows, ahead(x, theta, model)) for x, theta in replicas]))
 
-    each = (NoisyDrivers(model, solution.theta, sigma, memory) for memory in MEMORIES_S)
-    best = min((_as_large(problem, solution, drivers, noise_m) for drivers in each), key=partial(unlike, "past"))
-    more = _as_large(problem, solution, replace(best, by_speed=True), noise_m)
-    return min((best, more), key=partial(unlike, "sizes"))
+    mine = {name: share(rows, ahead(problem, solution.theta, model)) for name, share in of_errors.items()}
+    each = [NoisyDrivers(model, solution.theta, sigma, memory) for memory in MEMORIES_S]
+    shares = [mean_share("past", _as_large(problem, solution, drivers, noise_m)) for drivers in each]
+    memory = np.exp(np.interp(mine["past"], np.maximum.accumulate(shares), np.log(MEMORIES_S)))
+    best = replace(each[0], memory_s=float(memory))
+    both = [_as_large(problem, solution, replace(best, by_speed=more), noise_m) for more in (False, True)]
+    return min(both, key=lambda drivers: abs(mean_share("sizes", drivers) - mine["sizes"]))
 
 
 def _as_large(problem: Problem, solution: Solution, drivers: NoisyDrivers, noise_m: float) -> NoisyDrivers:
@@ -135,8 +137,7 @@ def _shares(rows: Rows, model: Hypothesis, theta: np.ndarray) -> np.ndarray:
     speed = Problem(rows, None, _no_prior(theta)).predict(theta[None], model, EMPTY)[1][0]
     own = np.mean(np.diff(speed - rows.records.speed[rows.samples], axis=1, prepend=0.0) ** 2, axis=1)
     square = np.bincount(rows.group, own, len(theta)) / np.maximum(np.bincount(rows.group, minlength=len(theta)), 1)
-    shares: np.ndarray = np.sqrt(square / np.median(square[square > 0.0]))
-    return shares
+    return np.asarray(np.sqrt(square / np.median(square[square > 0.0])))
 
 
 def statistics(seed: int) -> dict[str, Statistic]:
@@ -159,8 +160,8 @@ def agreement(
     beside drift. ``sizes``: what it tells of the errors' sizes, which even noise leaves alone. ``past``: what a
     driver's other errors take. ``tails``: what lies in the worst windows. ``leading``: what a ``term`` takes in
     whitened windows. Every replica has drivers' noise and that of sensors (``noise_m``). Drivers are fitted to it in
-    windows of 5 s, as those of ``solution`` are to the data. Scene, tails and leading claim that something is missing:
-    together they may be wrong in 5 % (Bonferroni), and have more replicas until that is clear.
+    windows of 5 s, as those of ``solution`` are to the data. Scene, tails and leading claim that something is missing,
+    and have more replicas until that is clear.
     """
     of_errors, random = statistics(seed), np.random.default_rng(seed)
     drivers = drivers_of(problem, solution, noise_m, of_errors)
@@ -179,19 +180,25 @@ def agreement(
 
     claims = ["scene", "tails", *([] if term is None else ["leading"])]
     mine = told(problem, solution.theta, [*of_errors, *claims[2:]])
-    above, draws = dict.fromkeys(mine, 0), dict.fromkeys(mine, 0)
+    shares: dict[str, list[float]] = {name: [] for name in mine}
+
+    def exceedances(name: str) -> int:
+        return sum(share >= mine[name] for share in shares[name])
+
+    def likeness(name: str) -> ladder.Agreement:
+        count, replicas = exceedances(name), len(shares[name])
+        p_value = count / replicas if count == ENOUGH else (count + 1) / (replicas + 1)
+        return ladder.Agreement(mine[name], p_value, replicas, float(np.mean(shares[name])))
+
     for draw in range(1, MOST + 1):
-        still = [n for n in mine if above[n] < ENOUGH and (draw <= DRAWS or n in claims)]
+        still = [n for n in mine if exceedances(n) < ENOUGH and (draw <= DRAWS or n in claims)]
         # Of what is clearly refused no more is asked, and nothing else then: something is missing.
-        if not still or (draw > CLEAR and not all(above[n] for n in claims)):
+        if not still or (draw > CLEAR and not all(exceedances(n) for n in claims)):
             break
         replica, theta = _fitted(problem, drivers, random, noise_m)
-        for name, value in told(replica, theta, still).items():
-            above[name] += value >= mine[name]
-            draws[name] = draw
-    p = {name: a / draws[name] if a == ENOUGH else (a + 1) / (draws[name] + 1) for name, a in above.items()}
-    level = dict.fromkeys(claims, ladder.LEVEL / len(claims))
-    return drivers, {n: ladder.Agreement(mine[n], p[n], draws[n], level.get(n, ladder.LEVEL)) for n in mine}
+        for name, share in told(replica, theta, still).items():
+            shares[name].append(share)
+    return drivers, {name: likeness(name) for name in mine}
 
 
 def _no_prior(theta: np.ndarray) -> Population:

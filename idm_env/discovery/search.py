@@ -103,9 +103,8 @@ class Search:
         errors = self.problem.errors(solution.theta[None], solution.model, solution.values[None])[0]
         noise = noises.estimate(errors, self.problem.rows.joined)
         prior = population(solution.theta, self.problem.rows, solution.model.catalogue.own)
-        return replace(
-            self.problem, noise=noise, prior=replace(prior, error_correlation_s=self.problem.prior.error_correlation_s)
-        )
+        prior = replace(prior, error_correlation_s=self.problem.prior.error_correlation_s)
+        return replace(self.problem, noise=noise, prior=prior)
 
     def round(self, solution: Solution, number: int, first: bool = True) -> tuple[list[Scored], np.ndarray]:
         """Score every candidate on top of ``solution``; return them and the null's held-out squares [units].
@@ -116,9 +115,8 @@ class Search:
         if not first and (shape := solution.model.terms[-1]).fades:
             self.on_progress(f"round {number}", 0, 1, f"{shape.label} by another state")
             before = held_out(self.problem, solution)
-            return self._curves(
-                solution, places.respond(self.problem, solution), before, number, _surfaces(shape)
-            ), before
+            responses = places.respond(self.problem, solution)
+            return self._curves(solution, responses, before, number, _surfaces(shape)), before
         have = {t.label for t in solution.model.terms}
         before = held_out(self.problem, solution)
         untried = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]

@@ -159,7 +159,8 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
     rounds: list[Round] = []
     last: Round | None = None
     for number in range(1, MOST_ROUNDS + 2):
-        if len(steps) == MOST_ROUNDS or (steps and (_is_whole(now) or _at_floor(searching, now))):
+        # Beside a surface nothing more is sought.
+        if len(steps) == MOST_ROUNDS or (steps and (now.model.terms[-1].by or _at_floor(searching, now))):
             break
         scored, before = searching.round(now, number, not steps)
         scored = [s for s in scored if not _same_class(s.term, now.model)]
@@ -200,11 +201,6 @@ def _tested(searching: Search, scored: Sequence[Scored], seed: int) -> Tested:
     return at_level(
         westfall_young(np.array([s.gains for s in scored]), seed, searching.units.run), 1.0 - CLOSED_LOOP_SHARE
     )
-
-
-def _is_whole(now: Solution) -> bool:
-    """Tell whether the last term is a surface, beside which nothing more is sought."""
-    return bool(now.model.terms[-1].by)
 
 
 def _is_shape(now: Solution) -> bool:

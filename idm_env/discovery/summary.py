@@ -10,7 +10,7 @@ from idm_env.data import Trajectories, noise_sigma
 from idm_env.discovery import bases, crossed, fleet, judge, result, words
 from idm_env.discovery.compare import RUNS, Comparison, changes, compare
 from idm_env.discovery.judgement import Evaluation, Judgement
-from idm_env.discovery.ladder import Ladder
+from idm_env.discovery.ladder import TOGETHER, Ladder
 from idm_env.discovery.march import CURVE
 from idm_env.discovery.model import STATES, Term
 from idm_env.discovery.power import Strength, powerful, strength_of
@@ -175,7 +175,8 @@ def unsure(ladder: Ladder | None, refusal: Refusal) -> tuple[Verdict, Refusal]:
 
     Noise of drivers explains them where it looks like them in every test; an effect of an unknown form does, too.
     """
-    if ladder is not None and ladder.tails is not None and ladder.tails.is_refused:
+    tails = None if ladder is None else ladder.tails
+    if tails is not None and tails.is_refused and tails.share - tails.usual > TOGETHER:
         return Verdict.UNEXPLAINED, Refusal(Reason.TAILS)
     return Verdict.NONE if ladder is not None and ladder.agrees else Verdict.UNDECIDED, refusal
 

@@ -237,7 +237,8 @@ def tails(ladder: Ladder | None) -> list[str]:
     where, p = ladder.worst, number(ladder.tails.p_value, 2)
     lies = f", {where.share:.0%} of it {where.where} ({where.of_all:.0%} of the time)" if where is not None else ""
     share = f"The worst {WORST:.0%} of predictions hold {ladder.tails.share:.0%} of the squared error{lies}"
-    return [f"{share}; noise of drivers holds as much with p = {p}, from {ladder.tails.replicas} simulations."]
+    usual = f"by drivers' noise it would be {ladder.tails.usual:.0%}"
+    return [f"{share}; {usual} (as much with p = {p}, from {ladder.tails.replicas} simulations)."]
 
 
 def common(shared: Shared) -> str:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from idm_env.data import synthetic
 from idm_env.discovery import discover
 from idm_env.discovery.power import WIDTHS, strength_of
+from idm_env.discovery.score import half_width
 
 pytestmark = pytest.mark.usefixtures("two_laws")
 
@@ -20,4 +22,8 @@ def test_a_latency_below_one_step_is_nobody_s() -> None:
         assert solution is not None
         strength = strength_of(solution, found.problem, name)
         assert strength is not None
-        assert strength.seen == pytest.approx(least + WIDTHS * 0.5 * (strength.high - strength.low))
+        (width,) = half_width(solution, found.problem)[solution.model.where(name)]
+        assert strength.seen == pytest.approx(least + WIDTHS * width)
+        wander = found.problem.noise.wander  # type: ignore[union-attr]
+        wide = 0.5 * (strength.high - strength.low)
+        assert wide == pytest.approx(np.hypot(width, 1.96 * (0.01 + wander) * strength.typical))
