@@ -106,8 +106,8 @@ def vector() -> None:
             for action in random:
                 env.step(action)
 
-        least = told(f"vector of {count} rings", {"a step": Case(run, steps)})["a step"]
-        print(f"  {count / least / 1e3:.2f} M env steps per CPU second", flush=True)
+        mean = told(f"vector of {count} rings", {"a step": Case(run, steps)})["a step"]
+        print(f"  {count / mean / 1e3:.2f} M env steps per CPU second, over all rounds", flush=True)
 
 
 def effects() -> None:
@@ -119,18 +119,20 @@ def effects() -> None:
         except ValueError:
             continue
         names.append(name)
-    zero = np.zeros((1024, 1), np.float32)
     for name in names[1:]:
         numbers, windows = {}, {}
         for own in (None, name):
             keywords = {} if own is None else {"effects": [own]}
             env = gym.make_vec("DiffIDM-v0", num_envs=1024, task="ring", **keywords)
             env.reset(seed=0)
-            numbers[str(own)] = Case(lambda env=env: [env.step(zero) for _ in range(20)], 20)
+            numbers[str(own)] = Case(lambda env=env: [env.step(None) for _ in range(20)], 20)
             windows[str(own)] = of({**RING, **keywords}, 64, 100, True)["unroll"]
         by = [measure(cases, ROUNDS) for cases in (numbers, windows)]
         cells = [t[str(name)][f"cpu_{k}_ms"] / t["None"][f"cpu_{k}_ms"] for t in by for k in ("min", "median")]
-        print("  {:24s} vector 1024 {:5.2f} ({:5.2f}) × plain   unroll 64 {:5.2f} ({:5.2f}) × plain".format(name, *cells), flush=True)
+        print(
+            "  {:24s} vector 1024 {:5.2f} ({:5.2f}) × plain   unroll 64 {:5.2f} ({:5.2f}) × plain".format(name, *cells),
+            flush=True,
+        )
 
 
 def cores() -> None:
@@ -144,13 +146,16 @@ def cores() -> None:
 
         taken = measure({f"{n} core{'s' * (n > 1)}": Case(partial(on, n), steps) for n in (1, 2)}, ROUNDS)
         (one, two) = ([t[f"wall_{k}_ms"] for k in ("min", "median")] for t in taken.values())
-        print(f"unroll, {count} rings × {steps}, wall ms a step: {one[0]:.3f} ({one[1]:.3f}) on one core, {two[0]:.3f} "
-              f"({two[1]:.3f}) on two: {one[0] / two[0]:.2f} ({one[1] / two[1]:.2f}) ×", flush=True)
+        print(
+            f"unroll, {count} rings × {steps}, wall ms a step: {one[0]:.3f} ({one[1]:.3f}) on one core, {two[0]:.3f} "
+            f"({two[1]:.3f}) on two: {one[0] / two[0]:.2f} ({one[1] / two[1]:.2f}) ×",
+            flush=True,
+        )
     torch.set_num_threads(1)
 
 
 def told(title: str, cases: Cases) -> dict[str, float]:
-    """Time cases in turn, without what ``AWAY`` says; print and return milliseconds a step."""
+    """Time cases in turn, without what ``AWAY`` says; print least and median, and return means, milliseconds a step."""
     print(title, flush=True)
     result = {}
     for case in cases.values():
@@ -162,7 +167,7 @@ def told(title: str, cases: Cases) -> dict[str, float]:
             case.run()
             taken[name].append((time.process_time() - before - AWAY[0]) / case.units * 1e3)
     for name, each in taken.items():
-        result[name] = min(each)
+        result[name] = sum(each) / len(each)
         print(f"  {name:32s} {min(each):9.4f} ({sorted(each)[len(each) // 2]:.4f}) ms", flush=True)
     return result
 
