@@ -130,16 +130,14 @@ class Looks:
                 out[name.replace(" ", "_")] = x.expand(step.many, x.shape[-1] if x.dim() else 1)
             return out
 
-        with torch.no_grad():
-            form = Form.of(like.state._replace(lanes=None), inputs_of(**step.inputs))
+        form = Form.of(like.state._replace(lanes=None), torch.no_grad()(inputs_of)(**step.inputs))
         self.wishes: Any = decision(simulator, form) if simulator.lane_change_models else None
         if isinstance(self.wishes, str):
             raise Untraceable(self.wishes)
         slots = () if self.wishes is None else self.wishes.slots
         self.names = {name: None for slot in slots if (name := side_of(slot)[1]) not in KINDS and "." not in name}
         self.loops = RowFunction(looked, step.inputs, step.many)
-        shapes = {n: (plan.rows, *shape) for n, shape in self.loops.shapes.items()}
-        self.arrays = Room(shapes, self.loops.types).arrays
+        self.arrays = Room(self.loops, plan.rows, self.loops.outs).arrays
 
 
 class LaneTables(Tables):

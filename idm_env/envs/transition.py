@@ -176,8 +176,7 @@ class Tables:
         self._watched = [(own, p, x, x._version) for own in params.values() for p, x in own.items()]
         names = [recorded.parameters[n] for n in recorded.wanted]
         self.wanted = [(i, params[e][p]) for i, (e, p) in enumerate(names)]
-        shapes = {n: (plan.rows, *recorded.forward.shapes[n]) for n in recorded.told if n != "clock"}
-        self.room = Room(shapes, recorded.forward.types)
+        self.room = Room(recorded.forward, plan.rows, [n for n in recorded.told if n != "clock"])
 
     def _array(self, x: Tensor) -> Array:
         wide = self.plan.size if _wide(x) else 1

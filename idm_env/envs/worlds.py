@@ -126,13 +126,13 @@ class RowTable:
 
 
 class Room:
-    """Arrays of fixed shapes that are taken together: one piece of memory for each of their types."""
+    """Arrays of outputs of loops that are taken together: one piece of memory for each of their types."""
 
-    def __init__(self, shapes: Mapping[str, tuple[int, ...]], types: Mapping[str, Any]) -> None:
+    def __init__(self, loops: RowFunction, rows: int, names: Sequence[str]) -> None:
         self._sizes: dict[Any, int] = {}
         self._at: list[tuple[str, Any, int, tuple[int, ...]]] = []
-        for name, shape in shapes.items():
-            kind = np.dtype(types[name])
+        for name in names:
+            kind, shape = np.dtype(loops.types[name]), (rows, *loops.shapes[name])
             begin = self._sizes.get(kind, 0)
             self._at.append((name, kind, begin * kind.itemsize, shape))
             self._sizes[kind] = begin + math.prod(shape)

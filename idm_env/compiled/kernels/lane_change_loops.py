@@ -408,6 +408,9 @@ def decide(
 
 @exact
 def each_row(loops, rows, table):
-    """Call loops over single rows."""
-    for row in rows:
-        call_rows(loops, row, row + 1, table)  # type: ignore[call-arg]
+    """Call loops over some rows, and over neighbours at once."""
+    first = 0
+    for i in range(len(rows)):
+        if i + 1 == len(rows) or rows[i + 1] != rows[i] + 1:
+            call_rows(loops, rows[first], rows[i] + 1, table)  # type: ignore[call-arg]
+            first = i + 1
