@@ -188,14 +188,15 @@ def planned(
     program = kernel.program
     values = [static_of(simulator, state, params, n) for n in (*program.statics, *program.parameters)]
     numbers = [part_of(inputs, n) for n in kernel.numbers]
-    kind = state.speed.dtype
-    operands = [operand(x.to(kind), batch, size) for x in values]
+    operands = [operand(x.to(state.speed.dtype), batch, size) for x in values]
     operands += [operand(x, batch, size, steps) for x in (*numbers, *(part_of(inputs, n) for n in kernel.flags))]
     strides = table([*(s for _, s in operands), (0, size, 1)])
     differentiated = list[Tensor]()
     if torch.is_grad_enabled():
         differentiated = _differentiated(program.moving, state, values[len(program.statics) :], numbers, kernel.signals)
     tape = any(x.requires_grad for x in differentiated)
+    # Without a tape nobody asks for states between, and whole rows stay in the cache.
+    block *= 1 if tape or kernel.signals or size > tiles.TILE else 4
     plan = RolloutPlan(
         kernel, simulator, state, inputs, params, steps, min(block, steps), keep, tape,
         tuple(a for a, _ in operands), strides,
