@@ -15,7 +15,7 @@ from idm_env.discovery import calibrate, judge, march, model as terms, noise, re
 from idm_env.discovery.finish import Discovery, finished
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.judgement import Evaluation
-from idm_env.discovery.model import Hypothesis, Term
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import Decided, decide
@@ -89,8 +89,9 @@ def discover(
     refuse_nan(prepared.episodes, law, tried)
     fit_runs, test_runs = _split(prepared, lockbox, seed)
     rows = records.windows(prepared.of_runs(fit_runs))
-    known_terms = tuple(_known_term(prepared, name) for name in known)
-    own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]
+    # Profiles over places as the file gives them.
+    known_terms = tuple(terms.known_profile(n, *_profile(prepared, ALL[n].column), prepared.period) for n in known)
+    own = [e for e in tried if e.kind not in PACKAGED or e != make(e.kind)]
     extra = [*own, *(terms.known_effect(term) for term in known_terms)]
     options = (list(map(repr, tried)), tuple(known), seed, located, lockbox, repr(law))
     test = prepared.of_runs(test_runs) if test_runs else None
@@ -148,11 +149,6 @@ def _chosen(effects: Sequence[str | Effect | type[Effect]] | None, null_effects:
     return list({e.name: e for e in chosen}.values())
 
 
-def _plain(effect: Effect) -> bool:
-    """Tell whether an effect is as its name makes it."""
-    return effect == make(effect.kind)
-
-
 def prepare(trajectories: Trajectories, by: str, place: str | None = None) -> Records:
     """Return the flat records of smoothed episodes, thinned where there are more than can be rolled out in time.
 
@@ -194,11 +190,6 @@ def _measured(prepared: Records, effect: Effect) -> Effect:
     return replace(effect, knots=knots, profile=tuple(profile), period=prepared.period or None)  # type: ignore[call-arg]
 
 
-def _known_term(prepared: Records, name: str) -> Term:
-    """Return the effect with its profile over places as the file gives it."""
-    return terms.known_profile(name, *_profile(prepared, ALL[name].column), prepared.period)
-
-
 def _profile(prepared: Records, column: str) -> tuple[float, float, list[float]]:
     """Return first place, distance and values of a column over places; DataError where no record tells."""
     # Where a record does not tell, the profile of the others is taken for the same place.
@@ -213,7 +204,6 @@ def _profile(prepared: Records, column: str) -> tuple[float, float, list[float]]
     count = int(np.clip((high - low) / 30.0, 3, 60))
     distance = (high - low) / (count if period else count - 1)
     index = np.round((place - low) / distance).astype(int) % count
-    total = np.bincount(index, value, minlength=count)
-    number = np.bincount(index, minlength=count)
+    total, number = (np.bincount(index, weights, count) for weights in (value, None))
     profile = np.interp(np.arange(count), np.flatnonzero(number), total[number > 0] / number[number > 0])
     return low, distance, profile.tolist()

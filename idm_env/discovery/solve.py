@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.compiled.kernels import threads
 from idm_env.discovery import march
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.noise import Noise
@@ -90,9 +91,15 @@ class Problem:
         on = np.tile(model.on, (copies, 1))
         pulse = np.zeros((copies, 3)) if pulse is None else march.pulsed(catalogue, pulse, on, phi)
         loop, working = march.loop(catalogue, dt), model.at_work
-        measured = records.signals, records.bounds, rows.record, rows.start, rows.steps, rows.group, records.length
         law = np.exp(theta), phi, on, model.tables, march.back_steps(working, dt), *march.lead_steps(working, dt)
-        loop.march(*measured, *law, rows.every, dt, loop.varying, pulse, gap, speed)
+
+        def roll(begin: int, end: int) -> None:
+            some, part = slice(begin, end), np.empty((2, copies, end - begin, count))
+            measured = records.signals, records.bounds, rows.record[some], rows.start[some], rows.steps
+            loop.march(*measured, rows.group[some], records.length, *law, rows.every, dt, loop.varying, pulse, *part)
+            gap[:, some], speed[:, some] = part
+
+        threads.split(roll, len(rows), 1, threads.count(copies * len(rows) * rows.steps))
         return gap, speed
 
     def errors(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from idm_env.compiled.kernels import threads
 from idm_env.discovery import march, model as terms
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.march import Catalogue
@@ -155,6 +157,22 @@ def test_windows_share_their_winding_up(platoon: Records) -> None:
     for i in (1, 5, len(rows) - 1):
         pick = {name: getattr(rows, name)[[i]] for name in ("record", "start", "valid", "joined", "block")}
         assert np.array_equal(ends(replace(rows, **pick))[0], together[i])
+
+
+def test_threads_change_no_bit(platoon: Records, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows are rolled out in as many threads as torch has, and none ends elsewhere, whoever winds up its memory."""
+    problem, pieces, split = Problem(windows(platoon), None, first_prior()), list[tuple[int, int]](), threads.split
+    model, values = Hypothesis((terms.simple("memory"), terms.simple("delay"))), np.array([[0.7, 40.0, 0.46]])
+
+    def watched(run: Callable[[int, int], None], *how: int) -> None:
+        split(lambda begin, end: (pieces.append((begin, end)), run(begin, end))[1], *how)
+
+    monkeypatch.setattr(threads, "split", watched)
+    ends = []
+    for many in (1, 3):
+        monkeypatch.setattr(threads, "count", lambda work, many=many: many)
+        ends.append(problem.predict(np.tile(THETA, (1, problem.groups, 1)), model, values))
+    assert np.array_equal(*ends) and len(pieces) == 4
 
 
 def test_a_printed_loop_depends_on_no_number() -> None:
