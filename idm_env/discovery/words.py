@@ -222,7 +222,7 @@ def beside_noise(verdict: Verdict, law: str, left_m: float, floor_m: float, ladd
     error = f"{law} leaves {number(left_m, 2)} m 5 s ahead, where sensors' noise is {number(floor_m, 2)} m"
     drivers = "unsteady drivers"
     if ladder is not None and ladder.unsteady is not None and ladder.unsteady[0] > 0.0:
-        drivers += f" of σ = {number(ladder.unsteady[0], 2)} m/s² (memory {number(ladder.unsteady[1])} s)"
+        drivers += f" of σ = {number(ladder.unsteady[0], 2)} m/s² (memory {number(ladder.unsteady[1], 2)} s)"
     if verdict is Verdict.NONE:
         return f"{error}: {drivers} do so. Nothing is missing that these data could show."
     if verdict is Verdict.UNDECIDED:

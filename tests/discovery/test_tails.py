@@ -27,11 +27,18 @@ def test_errors_somewhere_lie_together_and_it_is_told_where(platoon: Records) ->
     assert worst is not None and worst.where == "while the leader brakes" and worst.share > 0.8
 
 
-def told(p_scene: float, p_tails: float, p_sizes: float = 0.5, foreseen: float = 0.1, usual: float = 0.33) -> Ladder:
+def told(
+    p_scene: float,
+    p_tails: float,
+    p_sizes: float = 0.5,
+    foreseen: float = 0.1,
+    usual: float = 0.33,
+    uneven: float = 1.4,
+) -> Ladder:
     worst = tails.Worst("after a stop", 0.8, 0.3)
     made = SimpleNamespace(
         agreement=Agreement(0.01, p_scene, 39), tails=Agreement(0.42, p_tails, 39, usual), worst=worst,
-        unsteady=(0.21, 4.0), sizes=Agreement(0.1, p_sizes, 39), past=Agreement(foreseen, 0.025, 39),
+        unsteady=(0.21, 4.0), uneven=uneven, sizes=Agreement(0.1, p_sizes, 39), past=Agreement(foreseen, 0.025, 39),
     )  # fmt: skip
     made.agrees = Ladder.agrees.fget(made)  # type: ignore[attr-defined]
     return made  # type: ignore[return-value]
@@ -46,6 +53,7 @@ def told(p_scene: float, p_tails: float, p_sizes: float = 0.5, foreseen: float =
         (told(0.5, 0.1), Verdict.UNDECIDED),
         (told(0.5, 0.6, 0.1), Verdict.UNDECIDED),  # noise that grows with speed
         (told(0.5, 0.6, 0.5, 0.5), Verdict.UNDECIDED),  # a time gap that wanders
+        (told(0.5, 0.6, uneven=4.9), Verdict.UNDECIDED),  # T longer after a stop, and few drivers stop: told as none
         (told(0.5, 0.01), Verdict.UNEXPLAINED),
         (told(0.5, 0.01, usual=0.38), Verdict.UNDECIDED),  # hardly ever by noise, and hardly more than by noise
     ],
