@@ -336,18 +336,15 @@ class Walk:
         return self._cast(self._value(node), types.boolean)
 
     def _room_for(self, count: int, kind: Any) -> Pointer:
-        """Return fresh memory, zeros, which is given back at the end.
-
-        Loops go on to a whole number of vectors: of numbers that nobody wrote LLVM may take any branch, or none.
-        """
+        """Return fresh memory, which is given back at the end."""
         to = self._context.get_data_type(kind)
         size = ir.Constant(_WHOLE, count * self._context.get_abi_sizeof(to))
-        memory = self._builder.call(self._outside("calloc", _BYTE.as_pointer(), _WHOLE, _WHOLE), [_WHOLE(1), size])
+        memory = self._builder.call(self._outside("malloc", _BYTE.as_pointer(), _WHOLE), [size])
         self._taken.append(memory)
         return Pointer(kind, self._builder.bitcast(memory, to.as_pointer()), "own")
 
-    def _outside(self, name: str, returned: Any, *taken: Any) -> Any:
-        return cgutils.get_or_insert_function(self._builder.module, ir.FunctionType(returned, taken), name)
+    def _outside(self, name: str, returned: Any, taken: Any) -> Any:
+        return cgutils.get_or_insert_function(self._builder.module, ir.FunctionType(returned, [taken]), name)
 
 
 def _type_of(kind: Any) -> Any:

@@ -227,7 +227,10 @@ class RowFunction:
         # By a name of its own a constant is no memory that the loops might write to.
         arguments += "".join(f"    c{k} = c[{k}]\n" for k in range(len(self._constants) if self.lean else 0))
         room = {kind: max(1, size) for kind, size in self._room.items()}
-        parts = {"options": self.options, "imports": self.imports.format(kind=real.name), "around": self.around}
+        # Loops go on to a whole number of vectors: of numbers that nobody wrote LLVM may take any branch, or none.
+        rest = [f"    {w[0]}[{int(w[1:]) + k}] = 0\n" for w, n in self._widths.items() for k in range(n, padded(n))]
+        around = "".join(rest) + self.around
+        parts = {"options": self.options, "imports": self.imports.format(kind=real.name), "around": around}
         header = HEADER.format(kind=real.name, arguments=arguments, **parts, **room)
         self._held = [np.array(list(self._constants) or [0.0], real), *self._tables]
         self.fixed = addresses(self._held)
@@ -480,9 +483,7 @@ class RowFunction:
                 form.format(n - 1 if name == "flip" else -by[k] % n, n) if k in by else "{}"
                 for k, n in enumerate(shape)
             ]
-            return self._each(
-                to, shape, lambda cell: self._at(args[0], [m.format(j) for m, j in zip(moved, cell, strict=True)])
-            )
+            return self._each(to, shape, lambda cell: self._at(args[0], list(map(str.format, moved, cell))))
         if name == "searchsorted":
             return self._searched(args, kwargs, x, to)
         if name == "cumsum":
