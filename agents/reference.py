@@ -1,8 +1,8 @@
 """What needs no learning: families of policies beside which a test of agents on the ring says what it is worth.
 
-Constants, proportional rules, one line of a gap, Krauß's safe speed, FollowerStopper, random networks, and an oracle
-that is told the uniform speed. All policies of a family drive the same rings at once. A task that more than 5 % of the
-random policies pass is no test.
+Constants, proportional rules, one line of a gap, a rule that is searched for as long as an agent trains, Krauß's safe
+speed, FollowerStopper, random networks, and an oracle that is told the uniform speed. All policies of a family drive
+the same rings at once. A task that more than 5 % of the random policies pass is no test.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from idm_env.types import mapped
 ROWS_AT_ONCE = 192
 """Rings that are driven together: every step of all of them is kept."""
 RANDOM = ("random networks", "random linear policies")
+_SEARCHED = 1000
+"""Draw of the first rings of a search: judgements begin with draw 0."""
 HIDDEN: tuple[tuple[int, ...], ...] = ((32, 32), ())
 
 
@@ -121,6 +123,35 @@ def random_policies(environment: Mapping[str, Any], count: int, hidden: Sequence
     return policies
 
 
+def linear(numbers: Tensor) -> Family:
+    """Return the family of ``g (s − s0) + k Δv``, at most Krauß's safe speed, from numbers ``(policies, 3)``."""
+    names = ["{:.3g} s⁻² (s − {:.3g} m) + {:.3g} s⁻¹ Δv".format(*row) for row in numbers.tolist()]
+    return rules(
+        names, numbers.tolist(),
+        lambda task, view, uniform, g, gap, k: torch.minimum(
+            g * (view.gap - gap) + k * (view.lead_speed - view.speed), safe(task, view)
+        ),
+    )  # fmt: skip
+
+
+def searched(environment: Mapping[str, Any], generations: int = 3, count: int = 16) -> Family:
+    """Return the best linear rule of a cross-entropy search over the logarithms of its numbers, on rings of its own.
+
+    Three generations take about as long as APG trains.
+    """
+    drawing = torch.Generator().manual_seed(0)
+    low, high = torch.tensor([[1e-4, 2.0, 1e-3], [1.0, 8.0, 1.0]]).log()
+    middle, spread, best = (low + high) / 2.0, (high - low) / 2.0, list[tuple[Any, Tensor]]()
+    for generation in range(generations):
+        numbers = (middle + spread * torch.randn(count, 3, generator=drawing)).clamp(low, high)
+        rows = judge(linear(numbers.exp()), environment, (_SEARCHED + generation,), range(count))
+        best += [(score(row), x) for row, x in zip(rows, numbers, strict=True)]
+        best = sorted(best, key=lambda each: each[0], reverse=True)[: count // 4]
+        elite = torch.stack([x for _, x in best])
+        middle, spread = elite.mean(0), elite.std(0) + 0.05 * (high - low)
+    return linear(best[0][1][None].exp())
+
+
 def families(environment: Mapping[str, Any], count: int = 200) -> dict[str, Callable[[], Family]]:
     """Return what makes every family, by name; ``count`` random policies of each kind."""
     makers: dict[str, Callable[[], Family]] = {
@@ -138,6 +169,11 @@ def families(environment: Mapping[str, Any], count: int = 200) -> dict[str, Call
             lambda task, view, uniform, g, gap: g * (view.gap - gap), "{:g} s⁻² (s − {:g} m)",
             (0.001, 0.002, 0.004, 0.008, 0.016), (3.0, 4.0, 5.0),
         ),
+        "one line of a gap, at most Krauß's safe speed": lambda: grid(
+            lambda task, view, uniform, g, gap: torch.minimum(g * (view.gap - gap), safe(task, view)),
+            "{:g} s⁻² (s − {:g} m)", (0.001, 0.002, 0.004, 0.008, 0.016), (3.0, 4.0, 5.0),
+        ),
+        "searched rule": lambda: searched(environment),
         "Krauß's safe speed and a constant": lambda: grid(
             lambda task, view, uniform, accel, decel, seconds: torch.minimum(accel, safe(task, view, decel, seconds)),
             "{:g} m/s², b = {:g} m/s², τ = {:g} s",

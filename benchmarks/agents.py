@@ -83,9 +83,9 @@ LIMIT = 150.0
 """CPU seconds after which a training ends that has updates left."""
 SHOCKS: dict[str, dict[str, Any]] = {
     "": {"shock": 0.0},
-    "-shock": {"shock": 4.0},
+    "-shock": {"shock": 4.0, "shock_after": 120.0},
     "-two-shocks": {"shock": 5.0, "shock_after": [60.0, 120.0]},
-    "-long": {"shock": 4.0, "vehicles": 44, "length": [440.0, 540.0]},
+    "-long": {"shock": 4.0, "shock_after": 120.0, "vehicles": 44, "length": [440.0, 540.0]},
 }
 """What the human opposite does, by how the names of tests end: nothing, brake once, harder and twice, or once on a ring
 of 44, where one vehicle has twice as many humans to calm."""
@@ -592,7 +592,7 @@ def on_ring(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
     for name, family in families(environment).items():
         makers[name] = lambda family=family: tried(family(), environment)
     # Trained on the ring without a shock, as agents are.
-    training = {k: v for k, v in environment.items() if not k.startswith("shock")}
+    training = {**{k: v for k, v in environment.items() if not k.startswith("shock")}, "shock": 0.0}
     for name, updates in BEGUN.items():
         makers[name] = lambda updates=updates: tried(
             networks(begun(training, folder, updates), UNTRAINED_NAMES), environment

@@ -14,6 +14,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from idm_env.jobs.progress import silent
+from idm_env.tasks import make_task
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -157,6 +158,25 @@ def test_reference_rows_are_made_once_and_say_what_a_test_is_worth(benchmark, tm
     assert "failsafe: 4 of 20 random policies pass, so it is no test." in printed
     assert "failsafe-shock: 0 of 20 random policies pass, so it is a test." in printed
     assert set(benchmark.TESTS) == set(benchmark.environments())
+
+
+def test_the_reference_ring_with_a_shock_is_the_one_that_agents_are_judged_on(benchmark):
+    from agents.evaluate import as_judged
+
+    made = benchmark.environments()
+    assert {**made["failsafe-shock"], **as_judged(made["failsafe"])} == made["failsafe-shock"]
+    assert made["failsafe-long"]["shock_after"] == 120.0
+
+
+def test_networks_of_a_reference_row_train_where_nobody_brakes(benchmark, monkeypatch, tmp_path):
+    trained = []
+    monkeypatch.setattr(benchmark, "begun", lambda environment, folder, updates: trained.append(environment))
+    monkeypatch.setattr(benchmark, "networks", lambda policies, names: None)
+    monkeypatch.setattr(benchmark, "tried", lambda family, environment: {})
+    makers = benchmark.on_ring(benchmark.environments()["brakes-shock"], tmp_path)
+    for name in benchmark.BEGUN:
+        makers[name]()
+    assert trained and all(make_task(**environment).shock == 0.0 for environment in trained)
 
 
 def test_what_passes_behind_a_leader_is_asked_again_on_fresh_stretches(benchmark, monkeypatch):

@@ -55,6 +55,30 @@ def test_one_line_passes_the_ring_and_fails_the_long_one():
         assert reference.judge(family, environment, (0,), (line,))[0]["passed"] is passes
 
 
+def test_behind_a_safe_speed_the_line_passes_with_real_brakes_too():
+    """Without one it touches others; so a test of agents with real brakes has this row."""
+    brakes = {**SHOCK, "failsafe": 0.0, "max_command": [-4.5, 2.6]}
+    for name, passes in (("one line of a gap", False), ("one line of a gap, at most Krauß's safe speed", True)):
+        family = reference.families(brakes)[name]()
+        (row,) = reference.judge(family, brakes, (0,), (family.names.index("0.002 s⁻² (s − 4 m)"),))
+        assert row["passed"] is passes and (row["collisions"] == 0) is passes
+
+
+def test_a_search_keeps_the_best_rule_that_it_has_seen(monkeypatch):
+    """By the score on its own rings, never on those that judge; the same again from the same numbers."""
+    draws = []
+
+    def judged_by_gain(family, environment, draw, chosen):
+        draws.extend(draw)
+        return [float(family.names[i].split()[0]) for i in chosen]
+
+    monkeypatch.setattr(reference, "judge", judged_by_gain)
+    monkeypatch.setattr(reference, "score", lambda gain: -abs(gain - 0.01))
+    (name,) = reference.searched(SHOCK, 6, 24).names
+    assert float(name.split()[0]) == pytest.approx(0.01, rel=0.1) and name == reference.searched(SHOCK, 6, 24).names[0]
+    assert min(draws) >= 1000
+
+
 def test_policies_that_drive_together_do_what_each_does_alone(monkeypatch):
     """In one batch or alone, networks and rules alike."""
     for module in (reference, evaluate):
