@@ -1,8 +1,8 @@
 """What every task teaches, by one measure: ``python -m benchmarks.tasks [ring follow …]``.
 
 *Skill* is (return − human)/(best known − human), human being ``step(None)``, and best known the best row of the table;
-there is none where nobody does better than human drivers. Rows, all on the same 64 fresh episodes of the task with the
-keywords of ``GIVEN``:
+there is none where nobody does better than human drivers. Rows, all on the same fresh episodes of the task with the
+keywords of ``GIVEN``, 64 of them, on the roads of ``NOISY`` 640 under drivers' noise:
 
 * *random*, *zero*, and the *constant* that is best of 13 accelerations on other episodes;
 * *rule*: IDM's formula as commands, where they are added less a human's, its six numbers the best of a cross-entropy
@@ -11,7 +11,9 @@ keywords of ``GIVEN``:
 * *tuned PPO*: the same with ``TUNED``, twice the steps;
 * *APG*, on one lane: gradients through 60 decisions of 32 environments, 200 times, each seed's last policy;
 * *oracle*: that rule with the six numbers that are best in each of these episodes, found on it: what foresight
-  is worth.
+  is worth;
+* *planner*, in its place on open roads, in the first 64 episodes: every 20 s it drives copies of the world, with the
+  noise and arrivals to come, 200 s on under each of ``PLANS``, held for 20 s, and commands the best.
 
 Beside each its CPU seconds of one thread, crashes, and the 95 % interval of the paired difference over episodes. A
 *first task* has zero, constants and random at most at 0.3, and PPO at least at 0.7 with 4 of 5 seeds in 120 CPU s.
@@ -34,30 +36,35 @@ import tyro
 
 import idm_env  # noqa: F401 (registers the environments)
 from benchmarks import command, named_rows, table
+from idm_env.envs.batch import Batch
+from idm_env.envs.settings import settings
 from idm_env.jobs.progress import OnProgress
 from idm_env.jobs.workers import HERE, Workers
 from idm_env.tasks import TASKS
+from idm_env.types import mapped
 
 ROOT = Path(__file__).resolve().parents[1]
 EPISODES, FRESH, OTHERS = 64, 1 << 20, 1 << 19
 """Episodes that judge, their first seed, and that of episodes which choose constants and rules."""
 CONSTANTS = (-0.3, -0.1, -0.03, -0.01, -0.003, 0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
+OPEN = ("open_highway", "merge", "bottleneck", "approach")
+"""Roads that vehicles enter and leave."""
+NOISY = OPEN[:3]
+"""Those judged under drivers' noise on many episodes, since whether traffic breaks down is chance there."""
 GIVEN: dict[str, dict[str, Any]] = {
     "ring": {"hold": 1.0}, "follow": {"hold": 0.5}, "platoon": {"hold": 1.0}, "highway": {"hold": 1.0},
-    "replay": {"hold": 0.5}, "replay_lanes": {"hold": 0.5},
+    "replay": {"hold": 0.5}, "replay_lanes": {"hold": 0.5}, **{name: {"noise": 0.2} for name in NOISY},
 }  # fmt: skip
 """Keywords of each task here: agents decide at most twice a second."""
 TRAINING: dict[str, dict[str, Any]] = {"ring": {"warmup_pool": 256}, "highway": {"warmup_pool": 256}}
 """Keywords of training alone: episodes begin in one of so many worlds."""
-OPEN = ("open_highway", "merge", "bottleneck", "approach")
-"""Roads that vehicles enter and leave, whose episodes take longest: searches are a quarter as large there."""
 STEPS = {
     "ring": 250_000,
     "follow": 200_000,
     "platoon": 150_000,
     "highway": 250_000,
     "replay": 200_000,
-    **dict.fromkeys(OPEN, 50_000),
+    "approach": 50_000,
 }
 """Steps of PPO; of others 100 000."""
 TUNED: dict[str, Any] = {
@@ -80,12 +87,20 @@ RANGES = ((2.5, 40.0), (0.1, 3.0), (0.3, 6.0), (0.3, 3.0), (0.5, 4.0), (0.005, 1
 """Where rules are looked for: v0 (m/s), T (s), s0 (m), a, b (m/s²), and the share of IDM's acceleration."""
 IDM = ("desired_speed", "time_gap", "min_gap", "max_accel", "comfort_decel")
 
-IDLE, LEARNT = ("random", "zero", "constant"), ("PPO", "tuned PPO", "APG")
-"""Rows of what learns nothing, and those that have seeds."""
+PLANS, EVERY, AHEAD = (-0.3, 0.0, 0.3, 1.0), 20, 200
+"""Of planners: actions, the second being human driving, and decisions between choices and up to the horizon."""
+
+IDLE, LEARNT, FORESEES = ("random", "zero", "constant"), ("PPO", "tuned PPO", "APG"), ("oracle", "planner")
+"""Rows of what learns nothing, those that have seeds, and those that know what comes: the latter on open roads."""
 
 Act = Callable[[np.ndarray], np.ndarray]
 Watch = Callable[[Act], None]
 """Is shown a policy in training, now and then."""
+
+
+def episodes_of(task: str) -> int:
+    """Return how many episodes judge a task: ten times as many where traffic may break down."""
+    return EPISODES * (10 if task in NOISY else 1)
 
 
 def unwatched(act: Act) -> None:
@@ -107,7 +122,7 @@ def returns(task: str, act: Act | None, seeds: Sequence[int], **more: Any) -> tu
 
 def constant(task: str) -> Act:
     """Return the best of ``CONSTANTS``."""
-    seeds = range(OTHERS, OTHERS + (4 if task in OPEN else 16))
+    seeds = range(OTHERS, OTHERS + 16)
     best = max(CONSTANTS, key=lambda x: returns(task, held(task, x), seeds)[0].mean())
     return held(task, best)
 
@@ -154,7 +169,7 @@ def searched(task: str) -> np.ndarray:
     drawing = np.random.default_rng(0)
     low, high = np.log(RANGES).T
     middle, spread = (low + high) / 2.0, (high - low) / 2.0
-    count, each = (RULES // 2, 2) if task in OPEN else (RULES, 4)
+    count, each = (RULES // 2, 16) if task in OPEN else (RULES, 4)
 
     def mean(rules: np.ndarray, first: int, episodes: int) -> np.ndarray:
         pays = paid(task, rules.repeat(episodes, 0), [*range(first, first + episodes)] * len(rules))
@@ -181,6 +196,40 @@ def oracle(task: str, known: np.ndarray) -> np.ndarray:
         pays = paid(task, rules, np.repeat(each, RULES // 2).tolist()).reshape(EPISODES, -1)
         best, spread = rules[np.arange(EPISODES), pays.argmax(1)], 0.6 * spread
     return np.exp(best)
+
+
+def batch_of(task: str, seeds: Sequence[int]) -> Batch:
+    """Return episodes of a task as they begin, one for each seed."""
+    batch = Batch(settings(task=task, info="none", **GIVEN[task]), len(seeds))
+    batch.seed(range(len(seeds)), seeds)
+    batch.reset()
+    return batch
+
+
+def drive(batch: Batch, actions: np.ndarray, decisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Drive on under an action for each row; return what episodes pay and which have crashed, ``(n,)``."""
+    paid, crashed = np.zeros(batch.count), np.zeros(batch.count, bool)
+    for _ in range(decisions):
+        whole = batch.step(actions.astype(np.float32)[:, None]).whole
+        paid += np.where(crashed, 0.0, whole.reward)
+        crashed |= whole.terminated
+    return paid, crashed
+
+
+def planner(task: str, seeds: Sequence[int]) -> tuple[np.ndarray, int]:
+    """Return what episodes of these seeds return under the planner, and how many crash."""
+    world, actions = batch_of(task, seeds), np.tile(PLANS, len(seeds))
+    copies = batch_of(task, np.repeat(seeds, len(PLANS)).tolist())
+    total, crashed = np.zeros(len(seeds)), np.zeros(len(seeds), bool)
+    for _ in range(world.task.horizon or 0, 0, -EVERY):
+        copies.reset()  # forgets the normals that were drawn
+        copies.world = mapped(lambda x: x.repeat_interleave(len(PLANS), 0), world.world)
+        first, over = drive(copies, actions, EVERY)
+        then = np.where(over, 0.0, drive(copies, np.zeros_like(actions), AHEAD - EVERY)[0])
+        best = (first + then).reshape(len(seeds), -1).argmax(1)
+        paid, now = drive(world, np.array(PLANS)[best], EVERY)
+        total, crashed = total + np.where(crashed, 0.0, paid), crashed | now
+    return total, int(crashed.sum())
 
 
 def apg(task: str, seed: int, watch: Watch = unwatched) -> Act:
@@ -262,6 +311,9 @@ def row_of(part: Part, on_progress: OnProgress) -> dict[str, Any]:
     """Return the returns of a row, its crashes, and the CPU seconds that it took to find."""
     torch.set_num_threads(1)
     begin = time.process_time()
+    if part.row == "planner":
+        totals, crashes = planner(part.task, range(FRESH, FRESH + EPISODES))
+        return {"seconds": time.process_time() - begin, "returns": totals.tolist(), "crashes": crashes}
     makers: dict[str, Callable[[], Act | None]] = {
         "human": lambda: None, "zero": lambda: held(part.task, 0.0), "random": lambda: random(part.task),
         "constant": lambda: constant(part.task), "rule": lambda: rule(part.task, searched(part.task)),
@@ -272,17 +324,18 @@ def row_of(part: Part, on_progress: OnProgress) -> dict[str, Any]:
     act = makers[part.row]()
     spent = time.process_time() - begin
     more = {"observation": SEEN} if part.row in ("rule", "oracle") else {}
-    totals, crashes = returns(part.task, act, range(FRESH, FRESH + EPISODES), **more)
+    totals, crashes = returns(part.task, act, range(FRESH, FRESH + episodes_of(part.task)), **more)
     return {"seconds": spent, "returns": totals.tolist(), "crashes": crashes}
 
 
 def skills(rows: dict[Part, dict[str, Any]]) -> list[list[str]]:
     """Return the lines of one task's table: row, seed, return, skill and its interval, crashes, CPU seconds."""
     human = np.array(next(x["returns"] for part, x in rows.items() if part.row == "human"))
-    best = max(float(np.mean(x["returns"])) for x in rows.values()) - human.mean()
+    gains = {part: np.array(row["returns"]) - human[: len(row["returns"])] for part, row in rows.items()}
+    best = max(more.mean() for more in gains.values())
     lines = []
     for part, row in rows.items():
-        more = np.array(row["returns"]) - human
+        more = gains[part]
         half = 1.96 * float(more.std(ddof=1)) / len(more) ** 0.5
         skill = (f"{more.mean() / best:.2f}", f"{half / best:.2f}") if best > 0.0 else ("–", "–")
         crashes, spent = f"{row['crashes']}/{len(more)}", f"{row['seconds']:.0f}"
@@ -302,21 +355,23 @@ def teaches(lines: list[list[str]]) -> bool:
 
 
 def main(
-    tasks: tyro.conf.Positional[Sequence[str]] = (), rows: Sequence[str] = ("rule", "oracle", *LEARNT), seeds: int = 5,
+    tasks: tyro.conf.Positional[Sequence[str]] = (), rows: Sequence[str] = ("rule", *FORESEES, *LEARNT),
+    seeds: int = 5,
     out: Path = Path("runs/tasks.jsonl"), place: Workers = HERE,
 ) -> None:  # fmt: skip
     """Print the table of each task, and keep it in docs/skill.csv.
 
     Args:
         tasks: All if none is named.
-        rows: Beside those that cost nothing: rule, oracle, PPO, tuned PPO, APG.
+        rows: Beside those that cost nothing: rule, oracle or planner, PPO, tuned PPO, APG.
         seeds: Of PPO, tuned PPO and APG.
         out: File of rows.
         place: Where rows are worked out.
     """
     file, head = ROOT / "docs" / "skill.csv", ["task", "row", "seed", "return", "skill", "±", "crashes", "CPU s"]
     for task in tasks or TASKS:
-        parts = [Part(task, row) for row in ("human", *IDLE, *(x for x in rows if x not in LEARNT))]
+        without = {*LEARNT, FORESEES[task not in OPEN]}
+        parts = [Part(task, row) for row in ("human", *IDLE, *(x for x in rows if x not in without))]
         learns = [x for x in LEARNT if x in rows and task in {"APG": GRADIENTS, "tuned PPO": TUNED_ON}.get(x, TASKS)]
         parts += [Part(task, row, seed) for row in learns for seed in range(seeds)]
         done = named_rows(row_of, {str(part): part for part in parts}, out, place)

@@ -213,6 +213,8 @@ ROWS = {
     "from 0.001, and begins with a spread of commands of 0.37.",
     "APG": "*APG* are gradients through windows of traffic, the last policy of each seed.",
     "oracle": "*Oracle* is the rule with the numbers that are best in each of these episodes.",
+    "planner": "*Planner*, in the first 64 episodes: every 20 s the one of four actions under which a copy of the "
+    "world, with the noise and arrivals to come, pays most in 200 s.",
 }
 """What rows of a table of skill are."""
 
@@ -223,13 +225,13 @@ def _skill(name: str) -> list[str]:
     mine = [row[1:] for row in rows if row[0] == name]
     if not mine:
         return ["## Skill", "", f"Not measured yet: `python -m benchmarks.tasks {name}`.", ""]
-    from benchmarks.tasks import GIVEN
+    from benchmarks.tasks import GIVEN, episodes_of
 
     told = " ".join(words for row, words in ROWS.items() if row in {line[0] for line in mine})
     with_keywords = "".join(f", `{keyword}={value}`" for keyword, value in GIVEN.get(name, {}).items())
     return [
-        "## Skill", "", f"(return − human)/(best row − human), 64 fresh episodes{with_keywords}, ± 95 % of the paired "
-        "difference; none where no row is above human.", "",
+        "## Skill", "", f"(return − human)/(best row − human), {episodes_of(name)} fresh episodes{with_keywords}, ± 95 "
+        "% of the paired difference; none where no row is above human.", "",
         "| row | seed | return | skill | ± | crashes | CPU s |", "| --- | --- | --- | --- | --- | --- | --- |",
         *(f"| {' | '.join(row)} |" for row in mine), "",
         f"{told} `python -m benchmarks.tasks {name}`, 2026-11-27, one thread, no GPU.", "",
