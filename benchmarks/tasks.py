@@ -200,7 +200,7 @@ def oracle(task: str, known: np.ndarray) -> np.ndarray:
 
 def batch_of(task: str, seeds: Sequence[int]) -> Batch:
     """Return episodes of a task as they begin, one for each seed."""
-    batch = Batch(settings(task=task, info="none", **GIVEN[task]), len(seeds))
+    batch = Batch(settings(task=task, info="none", **GIVEN.get(task, {})), len(seeds))
     batch.seed(range(len(seeds)), seeds)
     batch.reset()
     return batch

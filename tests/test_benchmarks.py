@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 
-from benchmarks import command, kept_rows, lane_planner, lane_search, lane_tasks, lanes, named_rows
+from benchmarks import command, kept_rows, lane_planner, lane_search, lane_tasks, lanes, named_rows, tasks
 from idm_env.jobs.progress import OnProgress
 from idm_env.jobs.workers import Workers
 from idm_env.tasks import make_task
@@ -170,3 +170,13 @@ def test_a_planner_that_must_save_more_commands_less_and_each_row_is_of_the_same
     assert rows["planner, seldom"][2].tolist() == [[0, 0], [0, 0]]
     assert torch.equal(rows["planner, seldom"][0], rows["humans"][0])
     assert bool((rows["planner"][0] > rows["humans"][0]).all())
+
+
+@pytest.mark.parametrize("task", tasks.OPEN)
+def test_a_planner_that_only_knows_human_driving_drives_as_humans_do(task, monkeypatch):
+    """Its copies leave no trace in the world."""
+    monkeypatch.setattr(tasks, "AHEAD", 20)
+    monkeypatch.setitem(tasks.GIVEN, task, {**tasks.GIVEN.get(task, {}), "max_episode_steps": 40})
+    human, _ = tasks.returns(task, None, [0, 1])
+    monkeypatch.setattr(tasks, "PLANS", (0.0,))
+    assert tasks.planner(task, [0, 1])[0] == pytest.approx(human, rel=1e-6)
