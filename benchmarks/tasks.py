@@ -13,7 +13,7 @@ keywords of ``GIVEN``, 64 of them, on the roads of ``NOISY`` 640 under drivers' 
 * *oracle*: that rule with the six numbers that are best in each of these episodes, found on it: what foresight
   is worth;
 * *planner*, in its place on open roads, in the first 64 episodes: every 20 s it drives copies of the world, with the
-  noise and arrivals to come, 200 s on under each of ``PLANS``, held for 20 s, and commands the best.
+  arrivals to come and other noise, 200 s on under each of ``PLANS``, held for 20 s, and commands the best.
 
 Beside each its CPU seconds of one thread, crashes, and the 95 % interval of the paired difference over episodes. A
 *first task* has zero, constants and random at most at 0.3, and PPO at least at 0.7 with 4 of 5 seeds in 120 CPU s.
@@ -91,7 +91,7 @@ PLANS, EVERY, AHEAD = (-0.3, 0.0, 0.3, 1.0), 20, 200
 """Of planners: actions, the second being human driving, and decisions between choices and up to the horizon."""
 
 IDLE, LEARNT, FORESEES = ("random", "zero", "constant"), ("PPO", "tuned PPO", "APG"), ("oracle", "planner")
-"""Rows of what learns nothing, those that have seeds, and those that know what comes: the latter on open roads."""
+"""Rows of what learns nothing, those that have seeds, and those that foresee: the latter on open roads."""
 
 Act = Callable[[np.ndarray], np.ndarray]
 Watch = Callable[[Act], None]
@@ -222,7 +222,7 @@ def planner(task: str, seeds: Sequence[int]) -> tuple[np.ndarray, int]:
     copies = batch_of(task, np.repeat(seeds, len(PLANS)).tolist())
     total, crashed = np.zeros(len(seeds)), np.zeros(len(seeds), bool)
     for _ in range(world.task.horizon or 0, 0, -EVERY):
-        copies.reset()  # forgets the normals that were drawn
+        copies.reset()  # another episode: the noise to come is not known
         copies.world = mapped(lambda x: x.repeat_interleave(len(PLANS), 0), world.world)
         first, over = drive(copies, actions, EVERY)
         then = np.where(over, 0.0, drive(copies, np.zeros_like(actions), AHEAD - EVERY)[0])

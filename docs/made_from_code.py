@@ -214,7 +214,7 @@ ROWS = {
     "APG": "*APG* are gradients through windows of traffic, the last policy of each seed.",
     "oracle": "*Oracle* is the rule with the numbers that are best in each of these episodes.",
     "planner": "*Planner*, in the first 64 episodes: every 20 s the one of four actions under which a copy of the "
-    "world, with the noise and arrivals to come, pays most in 200 s.",
+    "world, with the arrivals to come and other drivers' noise, pays most in 200 s.",
 }
 """What rows of a table of skill are."""
 
