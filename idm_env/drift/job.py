@@ -61,16 +61,15 @@ def drift_file(
         mark = storage.fingerprint(source.path, replace(thinned, path=Path()), drivers)
         store = storage.Store(out / storage.UNFINISHED / "drift", mark, resume)
         answer = tell(*fitted, store=store, executor=executor, on_progress=progress)
-        best = answer.found[answer.one_of[0]] if answer.one_of else answer.steady
         progress("kept back", 0, 0, f"{len(rest)} drivers")
         sorts = {"no drift": answer.steady} | {name: e for name, e in answer.found.items() if not e.why_not}
         scores = held_out.scores(sorts, back[0], back[1]) if len(rest) and answer.verdict != "cannot_tell" else []
         foremost, foreseen = held_out.sentence(scores, next(iter(answer.one_of), None), len(rest))
-        best = sorts.get(foremost, best)
+        answer = replace(answer, foresees=foremost != "no drift")
+        best = sorts.get(foremost) or (answer.found[answer.one_of[0]] if answer.one_of else answer.steady)
         marked = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in fitted[0]])
         save_model(out / "model.yaml", replace(model_of(best), fitted_on=marked))
         data: dict[str, Any] = {"episodes": len(both[0]), "taken": len(taken), "dt": best.drivers.batch.dt}
-        data["account"] = page.account(trajectories.repairs, both[0].left_out)
         named = {"none": answer.steady, **answer.found}
         result = {
             "verdict": answer.verdict,
@@ -79,7 +78,7 @@ def drift_file(
             "sorts": _sorts(answer),
             "kept_back": {"drivers": len(rest), "scores": scores},
             "estimates": {name: [] if e.why_not else e.table() for name, e in named.items()},
-            "data": {**trajectories.summary(), **data},
+            "data": {**trajectories.summary(), **data, "account": page.account(trajectories.repairs, both[0].left_out)},
         }
         title, template = f"How the drivers of {trajectories.source} drift", Path(__file__).with_name("drift.html")
         report = page.write_report(out, title, template, result, tables=tables)
@@ -108,7 +107,7 @@ def model_of(estimate: Estimate) -> Model:
 
 def sentence(answer: Told) -> str:
     """Return in one sentence how drivers drift."""
-    if answer.verdict == "cannot_tell":
+    if answer.verdict == "cannot_tell" and answer.foresees:
         why = answer.steady.why_not or "; ".join(f"{name}: {e.why_not}" for name, e in answer.found.items())
         return f"These data cannot tell how drivers drift: {why}."
     if not answer.one_of:
@@ -124,9 +123,9 @@ def sentence(answer: Told) -> str:
             estimate, low, high = (float(row[end]) for end in ("estimate", "low", "high"))
             interval = f"{low:.3g} to {high:.3g}" if high < UNKNOWN * estimate else "these data do not tell it"
             parts.append(f"{symbol} {estimate:.3g}{unit} ({interval})")
-    others = ", ".join(f"{kinds[n].title} ({n})" for n in answer.one_of[1:])
-    apart = f" Not told apart from: {others}." if others else ""
-    return f"Drivers drift: {', '.join(parts)}.{apart}"
+    apart = "".join(f" Not told apart from {kinds[n].title} ({n})." for n in answer.one_of[1:])
+    unclear = "These data cannot tell how drivers drift. Likelier on those estimated, and worse in forecasts"
+    return f"{'Drivers drift' if answer.foresees else unclear}: {', '.join(parts)}.{apart}"
 
 
 def _sorts(answer: Told) -> list[dict[str, Any]]:

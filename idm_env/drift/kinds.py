@@ -34,12 +34,14 @@ class Told:
     """Estimates by name of the drift, that without any, and ``one_of``: sorts that the data do not tell apart.
 
     ``one_of`` is empty for drivers who do not drift; its first is the likeliest. Sorts that were not estimated
-    (``Estimate.why_not``) are compared with nothing.
+    (``Estimate.why_not``) are compared with nothing. ``foresees``: whether any forecasts drivers kept back better than
+    none does, as far as that was tried.
     """
 
     steady: Estimate
     found: Mapping[str, Estimate]
     one_of: tuple[str, ...]
+    foresees: bool = True
 
     @property
     def gain(self) -> dict[str, float]:
@@ -48,8 +50,11 @@ class Told:
 
     @property
     def verdict(self) -> str:
-        """``none``, ``named``, ``one_of``, or ``cannot_tell`` where no sort or no steady driver is estimated."""
-        if self.steady.why_not or all(e.why_not for e in self.found.values()):
+        """``none``, ``named``, ``one_of``, or ``cannot_tell``.
+
+        The last where no sort or no steady driver is estimated, or where what is likelier forecasts worse.
+        """
+        if self.steady.why_not or all(e.why_not for e in self.found.values()) or (self.one_of and not self.foresees):
             return "cannot_tell"
         return "none" if not self.one_of else "named" if len(self.one_of) == 1 else "one_of"
 

@@ -201,6 +201,26 @@ def test_what_is_not_finite_or_at_a_limit_is_not_estimated(monkeypatch: pytest.M
     assert "s (these data do not tell it)" in told and " to " in told and "e+" not in told
 
 
+def test_drift_that_forecasts_worse_than_none_is_not_said_to_be_there(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is likelier on drivers it was estimated on, and foresees others worse, is told as that, and not as found."""
+    file, scores = tmp_path / "made.csv", held_out.scores
+    names = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m", "gap_m")
+    driven(Wander(), 0.25, 8.0).table.select(names).write_csv(file)
+
+    def worse(*given: Any, **more: Any) -> list[dict[str, Any]]:
+        return [
+            {**x, "gap_crps_m": x["gap_crps_m"] * (1 + 9 * (x["model"] != "no drift"))} for x in scores(*given, **more)
+        ]
+
+    monkeypatch.setattr(held_out, "scores", worse)
+    monkeypatch.setattr("idm_env.drift.kinds.DRIFTS", (Wander(),))
+    report = drift_file(Source(file), tmp_path / "out", drivers=9)
+    assert report["verdict"] == "cannot_tell" and "Drivers drift" not in report["sentence"]
+    assert report["sentence"].startswith("No drift forecasts best") and "worse in forecasts: " in report["sentence"]
+
+
 @pytest.mark.parametrize(("wide", "narrow"), [(1.0, False), (1.6, True)])
 def test_bands_that_are_too_narrow_are_told_with_their_widening(wide: float, narrow: bool) -> None:
     """Truths are ``wide`` times as far apart as the draws: that is the factor, and the words come with it."""
