@@ -225,14 +225,16 @@ def _skill(name: str) -> list[str]:
     mine = [row[1:] for row in rows if row[0] == name]
     if not mine:
         return ["## Skill", "", f"Not measured yet: `python -m benchmarks.tasks {name}`.", ""]
-    from benchmarks.tasks import GIVEN, episodes_of
+    from benchmarks.tasks import GIVEN, NOISY, SLOW, episodes_of
 
     told = " ".join(words for row, words in ROWS.items() if row in {line[0] for line in mine})
+    if name in NOISY:
+        told += f" *Broken down* are episodes that return less than {SLOW:g} of human drivers' upper quartile."
     with_keywords = "".join(f", `{keyword}={value}`" for keyword, value in GIVEN.get(name, {}).items())
     return [
         "## Skill", "", f"(return − human)/(best row − human), {episodes_of(name)} fresh episodes{with_keywords}, ± 95 "
         "% of the paired difference; none where no row is above human.", "",
-        "| row | seed | return | skill | ± | crashes | CPU s |", "| --- | --- | --- | --- | --- | --- | --- |",
+        "| row | seed | return | skill | ± | crashes | broken down | CPU s |", f"|{' --- |' * 8}",
         *(f"| {' | '.join(row)} |" for row in mine), "",
         f"{told} `python -m benchmarks.tasks {name}`, 2026-11-27, one thread, no GPU.", "",
     ]  # fmt: skip

@@ -59,7 +59,8 @@ class ApproachTask(OpenLanesTask):
     first in a queue starts 1 s late. A queue of 20 leaves at 1860 vehicles an hour and lane with 2.1 s of start-up lost
     time (usual by the Highway Capacity Manual: 1800 to 1900, and 2 s). After the tasks of eco-driving at signals of
     IntersectionZoo (Jayawardana et al. 2024, arXiv 2410.15221), on one approach. Who comes, goes and acts is as in the
-    other open tasks.
+    other open tasks. ``randomise={"signal.cycle": [40, 80], "signal.red": [10, 40]}`` draws a plan for every episode,
+    while platoons come with the ``cycle`` of the keyword.
 
     Observation: as there; before the nearest vehicles the way to the signal (m), 1 if it is red, and the time to its
     next change (s). Reward, per agent: ``0.5 min(v/v0, 1) + 0.5 (1 − F/F_max)``, F its fuel rate (Kamal's), F_max = 4

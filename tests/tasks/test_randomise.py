@@ -91,6 +91,21 @@ def test_what_cannot_be_drawn_is_said_in_one_line(randomise: object, message: st
     assert "\n" not in str(told.value)
 
 
+def test_a_signal_plan_is_drawn_for_every_episode() -> None:
+    """Agents are shown the plan that drivers meet; a red longer than a cycle is no plan."""
+    plan = {"signal.cycle": [40, 80], "signal.red": [10, 40]}
+    task, seeds = make_task("approach", randomise=plan), torch.arange(50)
+    params = task.params(torch.float64, "cpu")
+    world = task.reset(Draw.of(seeds, seeds), params)
+    met = task.episode_params(world.episode, params)["signal"]
+    for name, (low, high) in (("cycle", plan["signal.cycle"]), ("red", plan["signal.red"])):
+        shown = world.episode[f"signal_{name}"]
+        assert torch.equal(shown, met[name].expand_as(shown)) and len(shown[:, 0].unique()) == 50
+        assert low <= float(shown.min()) and float(shown.max()) <= high
+    with pytest.raises(ValueError, match=r"signal\.red = 70 s must not exceed signal\.cycle = 40 s"):
+        make_task("approach", randomise=plan | {"signal.red": [10, 70]}).params(torch.float64, "cpu")
+
+
 def test_demand_is_drawn_for_every_episode_and_given_at_a_reset() -> None:
     """Within its range, each lane its own; ``reset(options=…)`` holds from then on."""
     task = make_task("merge", controlled=0.1, randomise={"inflow": [1500, 3000], "ramp_inflow": [400, 800]})
