@@ -193,7 +193,7 @@ def test_lanes_have_a_panel_each_and_changes_go_on_in_another():
 
 def test_a_road_is_drawn_to_scale_with_numbers_along_it():
     """A vehicle of 5 m by 1.9 m has these sides in pixels of one scale, where the road is no longer than the view."""
-    env = gym.make("DiffIDM-v0", task="highway", vehicles=2, length=500.0, render_mode="rgb_array")
+    env = gym.make("DiffIDM-v0", task="highway", vehicles=2, lanes_count=4, length=500.0, render_mode="rgb_array")
     env.reset(seed=1)
     picture = env.render()[72:].astype(int)
     assert picture.shape[1] == 1000
