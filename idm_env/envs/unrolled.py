@@ -71,7 +71,7 @@ def unroll(
         for name, x in (("actions", action), ("hidden numbers", hidden)):
             if x is not None and not bool(x.isfinite().all()):
                 raise ValueError(NO_NUMBERS.format(name))
-        action = (action if action.dtype == dtype else action.clamp(-1.0, 1.0).to(dtype)) + extra
+        action = action.clamp(torch.finfo(dtype).min, torch.finfo(dtype).max).to(dtype) + extra
         outcome = batch.step(action)
         seen = final = outcome.observation.reshape(batch.count, -1)
         over = np.flatnonzero((outcome.whole.terminated | outcome.whole.truncated).numpy())

@@ -347,13 +347,19 @@ def test_what_a_policy_between_steps_must_not_do_is_told_in_one_line_and_changes
     assert wrong == {}
 
 
-@pytest.mark.parametrize("policy", [ACT, lambda x: ACT(x), lambda x: ACT(x).double()])
-def test_doubles_are_the_numbers_that_they_are(policy):
-    """Loops in single precision read eight bytes as two numbers."""
+@pytest.mark.parametrize(
+    "around", [lambda act: act, lambda act: lambda x: act(x), lambda act: lambda x: act(x).double()]
+)
+@pytest.mark.parametrize("bias", [0.0, -1.1], ids=["within", "beyond"])
+def test_doubles_are_the_numbers_that_they_are(around, bias):
+    """Loops in single precision read eight bytes as two numbers; an action is clipped with its push, not before."""
+    torch.manual_seed(0)
+    act = nn.Linear(3, 1)
+    nn.init.constant_(act.bias, bias)
     env, other = (made("ring", CASES[0][1], "float32") for _ in range(2))
     env.reset(seed=3), other.reset(seed=3)
-    window = env.unroll(policy, 3, push=torch.full((5, 1), 0.25, dtype=torch.float64))
-    wanted = other.unroll(ACT, 3, push=torch.full((5, 1), 0.25))
+    window = env.unroll(around(act), 3, push=torch.full((5, 1), 0.25, dtype=torch.float64))
+    wanted = other.unroll(act, 3, push=torch.full((5, 1), 0.25))
     assert window.action.dtype == torch.float32
     torch.testing.assert_close(window.reward, wanted.reward)
 
