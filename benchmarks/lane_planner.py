@@ -28,8 +28,8 @@ from torch import Tensor
 from agents.rollout import SEED
 from benchmarks import command, table
 from benchmarks.lane_tasks import DEMANDS, by_place
+from benchmarks.tasks import batch_of
 from idm_env.envs.batch import Batch
-from idm_env.envs.settings import settings
 from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.types import mapped
 
@@ -49,10 +49,7 @@ Choose = Callable[[Batch, int], Tensor]
 def episodes_of(name: str, noise: float, seeds: Sequence[int]) -> Batch:
     """Return episodes of a row of tasks as they begin, one for each seed."""
     keywords: dict[str, Any] = {**DEMANDS[name], "reward": "delay", "crash_cost": 0.0, "noise": noise}
-    batch = Batch(settings(**keywords, info="none"), len(seeds))
-    batch.seed(range(len(seeds)), seeds)
-    batch.reset()
-    return batch
+    return batch_of(seeds, **keywords)
 
 
 def drive(batch: Batch, choices: Tensor, seconds: int) -> tuple[Tensor, Tensor]:

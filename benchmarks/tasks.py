@@ -201,9 +201,9 @@ def oracle(task: str, known: np.ndarray) -> np.ndarray:
     return np.exp(best)
 
 
-def batch_of(task: str, seeds: Sequence[int]) -> Batch:
-    """Return episodes of a task as they begin, one for each seed."""
-    batch = Batch(settings(task=task, info="none", **GIVEN.get(task, {})), len(seeds))
+def batch_of(seeds: Sequence[int], **keywords: Any) -> Batch:
+    """Return episodes of a task with ``keywords`` as they begin, one for each seed."""
+    batch = Batch(settings(**keywords, info="none"), len(seeds))
     batch.seed(range(len(seeds)), seeds)
     batch.reset()
     return batch
@@ -221,8 +221,8 @@ def drive(batch: Batch, actions: np.ndarray, decisions: int) -> tuple[np.ndarray
 
 def planner(task: str, seeds: Sequence[int]) -> tuple[np.ndarray, int]:
     """Return what episodes of these seeds return under the planner, and how many crash."""
-    world, actions = batch_of(task, seeds), np.tile(PLANS, len(seeds))
-    copies = batch_of(task, np.repeat(seeds, len(PLANS)).tolist())
+    keywords, actions = {"task": task, **GIVEN.get(task, {})}, np.tile(PLANS, len(seeds))
+    world, copies = (batch_of(x, **keywords) for x in (seeds, np.repeat(seeds, len(PLANS)).tolist()))
     total, crashed = np.zeros(len(seeds)), np.zeros(len(seeds), bool)
     for _ in range(world.task.horizon or 0, 0, -EVERY):
         copies.reset()  # another episode: the noise to come is not known

@@ -85,20 +85,20 @@ def drivers_of(
     speed if the scene then tells as much of the errors' ``sizes``.
     """
     model, rows = solution.model.fixed(solution.values), problem.rows
-    sigma = FIRST_SIGMA * _shares(rows, model, solution.theta)
+    error, sigma = ahead(problem, solution.theta, model), FIRST_SIGMA * _shares(rows, model, solution.theta)
 
     def mean_share(name: str, drivers: NoisyDrivers) -> float:
         random = np.random.default_rng(1)
         replicas = [_fitted(problem, drivers, random, noise_m) for _ in range(ALIKE)]
         return float(np.mean([of_errors[name](x.rows, ahead(x, theta, model)) for x, theta in replicas]))
 
-    mine = {name: share(rows, ahead(problem, solution.theta, model)) for name, share in of_errors.items()}
+    past, sizes = (of_errors[name](rows, error) for name in ("past", "sizes"))
     each = [NoisyDrivers(model, solution.theta, sigma, memory) for memory in MEMORIES_S]
     shares = [mean_share("past", _as_large(problem, solution, drivers, noise_m)) for drivers in each]
-    memory = np.exp(np.interp(mine["past"], np.maximum.accumulate(shares), np.log(MEMORIES_S)))
+    memory = np.exp(np.interp(past, np.maximum.accumulate(shares), np.log(MEMORIES_S)))
     best = replace(each[0], memory_s=float(memory))
     both = [_as_large(problem, solution, replace(best, by_speed=more), noise_m) for more in (False, True)]
-    return min(both, key=lambda drivers: abs(mean_share("sizes", drivers) - mine["sizes"]))
+    return min(both, key=lambda drivers: abs(mean_share("sizes", drivers) - sizes))
 
 
 def _as_large(problem: Problem, solution: Solution, drivers: NoisyDrivers, noise_m: float) -> NoisyDrivers:
@@ -178,8 +178,8 @@ def agreement(
         error = ahead(windowed, theta, drivers.model)
         return {n: of_errors[n](windowed.rows, error) if n in of_errors else gain(windowed, theta) for n in names}
 
-    claims = ["scene", "tails", *([] if term is None else ["leading"])]
-    mine = told(problem, solution.theta, [*of_errors, *claims[2:]])
+    leading = [] if term is None else ["leading"]
+    claims, mine = ["scene", "tails", *leading], told(problem, solution.theta, [*of_errors, *leading])
     shares: dict[str, list[float]] = {name: [] for name in mine}
 
     def exceedances(name: str) -> int:

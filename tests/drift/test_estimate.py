@@ -145,13 +145,19 @@ def test_the_model_of_a_file_drifts(tmp_path) -> None:
     assert model.parameters["wander"]["sigma"] == pytest.approx(rows["wander"]["sigma"])
 
 
+def written(folder: pathlib.Path) -> pathlib.Path:
+    """Write drivers whose time gap wanders, and return the file."""
+    file = folder / "made.csv"
+    names = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m", "gap_m")
+    driven(Wander(), 0.25, 8.0).table.select(names).write_csv(file)
+    return file
+
+
 def test_drivers_kept_back_are_foreseen_and_an_interrupted_run_goes_on(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Forecasts with the true drift beat those without, in bands that hold; a resumed run writes the same report."""
-    file = tmp_path / "made.csv"
-    names = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m", "gap_m")
-    driven(Wander(), 0.25, 8.0).table.select(names).write_csv(file)
+    file = written(tmp_path)
     whole = drift_file(Source(file), tmp_path / "whole")
     rows = {(row["model"], row["ahead_s"]): row for row in whole["kept_back"]["scores"]}
     assert whole["kept_back"]["drivers"] == DRIVERS // 4 and whole["data"]["taken"] == DRIVERS - DRIVERS // 4
@@ -205,9 +211,7 @@ def test_drift_that_forecasts_worse_than_none_is_not_said_to_be_there(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is likelier on drivers it was estimated on, and foresees others worse, is told as that, and not as found."""
-    file, scores = tmp_path / "made.csv", held_out.scores
-    names = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m", "gap_m")
-    driven(Wander(), 0.25, 8.0).table.select(names).write_csv(file)
+    file, scores = written(tmp_path), held_out.scores
 
     def worse(*given: Any, **more: Any) -> list[dict[str, Any]]:
         return [
