@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import polars as pl
@@ -29,7 +29,8 @@ from idm_env.jobs.workers import HERE, Workers
 from idm_env.prediction.pictures import scene_picture
 from idm_env.prediction.predict import predict
 from idm_env.prediction.scene import MapScene
-from idm_env.trajectories import baselines, paper
+from idm_env.trajectories import paper
+from idm_env.trajectories.baselines import BASELINES
 from idm_env.trajectories.noise import SPARSE_WHITE_M, fit_noise
 from idm_env.trajectories.recipe import clock_of, overlaps, recipe
 from idm_env.trajectories.report import before_and_after
@@ -77,8 +78,29 @@ def kalman(
     return RegularMotion(clock, state[0] + position_m[0], state[1], state[2])
 
 
+METHODS = {**BASELINES, "Kalman/RTS": kalman}
 DENSITIES = (0.01, 0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.3)
-baselines.BASELINES["Kalman/RTS"] = (kalman, tuple({"density": density} for density in DENSITIES))
+TUNED: dict[str, tuple[dict[str, Any], ...]] = {
+    "linear": ({},),
+    "moving average": tuple({"window": w} for w in (5, 9, 15, 21, 31, 41, 51, 61)),
+    "exponential": tuple({"width": w} for w in (3, 4, 5, 6, 7, 8, 10, 13, 17, 22)),
+    "bounded spline": tuple({"spacing": s} for s in (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)),
+    "Savitzky–Golay": tuple({"window": w, "order": o} for o in (2, 3, 5) for w in range(31, 122, 10)),
+    "Kalman/RTS": tuple({"density": density} for density in DENSITIES),
+}
+"""What a tuning tries of the free numbers of each method."""
+
+
+def truth_errors(pairs: Iterable[tuple[RegularMotion, RegularMotion]]) -> dict[str, float]:
+    """Return the errors of motions against true ones on the same clock; samples that have no truth do not count."""
+    squares, count = np.zeros(3), 0
+    for motion, truth in pairs:
+        columns = np.array([[each.position_m, each.speed_mps, each.accel_mps2] for each in (motion, truth)])
+        finite = np.isfinite(columns[1]).all(0)
+        count += int(finite.sum())
+        squares += ((columns[0] - columns[1])[:, finite] ** 2).sum(1)
+    names = ("position_rmse_m", "speed_rmse_mps", "accel_rmse_mps2")
+    return dict(zip(names, np.sqrt(squares / count).tolist(), strict=True))
 
 
 def truth_of(frame: pl.DataFrame, with_run: bool) -> Callable[[TrackPiece], RegularMotion]:
@@ -109,15 +131,15 @@ def score(
     ends: float = 0.0,
 ) -> dict[str, float | int]:
     """Return the row of a method; the first and last ``ends`` seconds of every track are not compared."""
-    tally = Tally()
+    tally, pairs = Tally(), []
     for track, motion in zip(tracks, motions, strict=True):
         tally.add(motion, track.time_s, track.position_m)
         true = truth(track)
         inside = np.abs(true.time_s - 0.5 * (true.time_s[0] + true.time_s[-1]))
         inside = inside <= 0.5 * (true.time_s[-1] - true.time_s[0]) - ends + 1e-6
         speed, accel = (np.where(inside, x, np.nan) for x in (true.speed_mps, true.accel_mps2))
-        tally.compare(motion, RegularMotion(true.time_s, true.position_m, speed, accel))
-    return tally.row()
+        pairs.append((motion, RegularMotion(true.time_s, true.position_m, speed, accel)))
+    return tally.row() | truth_errors(pairs)
 
 
 def line(name: str, row: dict[str, float | int], note: str = "") -> str:
@@ -139,7 +161,7 @@ def best_of(
 ) -> list[str]:  # fmt: skip
     """Tune a baseline on some tracks, for each figure by itself, and return what it does to the others."""
     rows: list[tuple[dict[str, float], dict[str, float | int]]] = []
-    for choice in baselines.BASELINES[name][1]:
+    for choice in TUNED[name]:
         whole = {**choice, **(given or {})}
         rows.append((whole, score(tuned, _motions(name, tuned, whole), truth, ends)))
     by_choice: dict[tuple, list[str]] = {}
@@ -155,7 +177,7 @@ def best_of(
 
 
 def _motions(name: str, tracks: list[TrackPiece], choice: dict[str, float]) -> list[RegularMotion]:
-    return [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), **choice) for t in tracks]
+    return [METHODS[name](t.time_s, t.position_m, clock_of(t, 0.1), **choice) for t in tracks]
 
 
 def halves(tracks: list[TrackPiece]) -> tuple[list[TrackPiece], list[TrackPiece]]:
@@ -183,7 +205,7 @@ def filtering(part: tuple[Path, int], _: OnProgress = silent) -> str:
         own = score(scored, [f.motion for f in ours], truth, ends)
         lines.append(line("ours", own, f"new overlaps {overlaps(ours)[1]}"))
         lines.append(line("the paper's recipe", score(scored, published, truth, ends)))
-        for name in baselines.BASELINES:
+        for name in METHODS:
             lines += best_of(name, tuned, scored, truth, ends)
     return "\n".join(lines)
 
@@ -219,7 +241,7 @@ def reconstruction(part: tuple[Path, str, float], _: OnProgress = silent) -> str
         steps = [one.motion for one in imitation]
         dense = [_dense(m, clock_of(t, 0.1)) for m, t in zip(steps, scored, strict=True)]
         lines.append(line("  … parameters fixed" if fixed else "the paper's recipe", score(scored, dense, truth)))
-    for name in baselines.BASELINES:
+    for name in METHODS:
         fixed_choice = {"sigma": SPARSE_WHITE_M} if name == "Kalman/RTS" else None
         lines += best_of(name, tuned, scored, truth, given=fixed_choice)
     return "\n".join(lines)

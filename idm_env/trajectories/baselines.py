@@ -5,7 +5,7 @@ necessarily regular) and the clock [K] on which the result is wanted; free numbe
 states them.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -141,20 +141,11 @@ def _least_squares(matrix: np.ndarray, target: np.ndarray, inequality: np.ndarra
     return free + np.linalg.solve(r, -residual[:-1] / residual[-1])
 
 
-Smoother = Callable[..., RegularMotion]
-Choice = Mapping[str, float]
-
-BASELINES: dict[str, tuple[Smoother, tuple[Choice, ...]]] = {
-    "linear": (linear, ({},)),
-    "moving average": (moving_average, tuple({"window": w} for w in (5, 9, 15, 21, 31, 41, 51, 61))),
-    "exponential": (exponential, tuple({"width": w} for w in (3, 4, 5, 6, 7, 8, 10, 13, 17, 22))),
-    "bounded spline": (bounded_spline, tuple({"spacing": s} for s in (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0))),
-    "Savitzky–Golay": (savitzky_golay, tuple({"window": w, "order": o} for o in (2, 3, 5) for w in range(31, 122, 10))),
+BASELINES: dict[str, Callable[..., RegularMotion]] = {
+    "linear": linear,
+    "moving average": moving_average,
+    "exponential": exponential,
+    "bounded spline": bounded_spline,
+    "Savitzky–Golay": savitzky_golay,
 }
-"""Name → function, and what a tuning tries of its free numbers."""
-
-
-def run(name: str, time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, **choice: float) -> RegularMotion:
-    """Apply a baseline by name; ``choice`` replaces the defaults of its free numbers."""
-    whole = {key: int(value) if key in ("window", "order") else value for key, value in choice.items()}
-    return BASELINES[name][0](time_s, position_m, clock, **whole)
+"""By name."""

@@ -9,7 +9,8 @@ import numpy as np
 import polars as pl
 
 from idm_env.jobs.shards import Parts
-from idm_env.trajectories import baselines, paper
+from idm_env.trajectories import paper
+from idm_env.trajectories.baselines import BASELINES
 from idm_env.trajectories.drivers import parameter_rows
 from idm_env.trajectories.recipe import Filtered, clock_of, nearest, overlaps, recipe
 from idm_env.trajectories.scores import RegularMotion, Tally
@@ -70,7 +71,7 @@ def done(
 
     ``remarks`` are what else is to be known of it. ``on_stage`` is called with the share done and what comes next.
     """
-    others = baselines.BASELINES if settings.baselines else ()
+    others = BASELINES if settings.baselines else {}
     stages = 2 + len(others)
     on_stage(0.0, "filtering")
     tallies: dict[str, Tally] = {}
@@ -86,10 +87,10 @@ def done(
         on_stage(1 / stages, "drivers' parameters")
         rows = [] if settings.fixed_parameters else parameter_rows(filtered, recent, settings.model)
     tallies[OURS[settings.recipe]] = _tally([f.motion for f in filtered], tracks, seconds)
-    for i, name in enumerate(others):
+    for i, (name, smoother) in enumerate(others.items()):
         on_stage((2 + i) / stages, f"to compare: {name}")
         begin = time.perf_counter()
-        motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, plan.dt)) for t in tracks]
+        motions = [smoother(t.time_s, t.position_m, clock_of(t, plan.dt)) for t in tracks]
         tallies[name] = _tally(motions, tracks, time.perf_counter() - begin)
     total, new = overlaps(filtered, recent)
     parts.write(number, TRAJECTORIES, _table(filtered))

@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from idm_env.trajectories import baselines, paper
+from idm_env.trajectories import paper
+from idm_env.trajectories.baselines import BASELINES
 from idm_env.trajectories.chunks import OURS, FilePlan, FilterSettings
 from idm_env.trajectories.recipe import clock_of, recipe
 from idm_env.trajectories.scores import RegularMotion
@@ -37,8 +38,8 @@ def score(spool: Spool, plan: FilePlan, settings: FilterSettings) -> list[dict[s
     else:
         ours = [f.motion for f in recipe(list(halves), plan.dt, plan.noise, plan.options)]
     motions = {OURS[settings.recipe]: ours}
-    for name in baselines.BASELINES if settings.baselines else ():
-        motions[name] = [baselines.run(name, t.time_s, t.position_m, clock_of(t, plan.dt)) for t in halves]
+    for name, smoother in BASELINES.items() if settings.baselines else ():
+        motions[name] = [smoother(t.time_s, t.position_m, clock_of(t, plan.dt)) for t in halves]
     spacing = float(np.median(np.concatenate([np.diff(t.time_s) for t in halves])))
     return [_row(name, motion, tracks, out, spacing) for name, motion in motions.items()]
 

@@ -1,4 +1,4 @@
-"""Metrics of trajectories: the paper's three, and errors against a truth where there is one.
+"""Metrics of trajectories: the paper's three.
 
 Shapes: everything of a trajectory is ``[samples]``, in SI units.
 """
@@ -71,10 +71,6 @@ class Tally:
     accel_square: float = 0.0
     implausible: int = 0
     seconds: float = 0.0
-    compared: int = 0
-    position_square: float = 0.0
-    speed_square: float = 0.0
-    accel_error_square: float = 0.0
 
     def add(self, motion: RegularMotion, time_s: np.ndarray, position_m: np.ndarray) -> None:
         """Count one trajectory against its data."""
@@ -89,24 +85,16 @@ class Tally:
         self.accel_square += float((size * size).sum())
         self.implausible += implausible(motion)
 
-    def compare(self, motion: RegularMotion, truth: RegularMotion) -> None:
-        """Count errors against a truth on the same clock; samples whose true value is NaN do not count."""
-        finite = np.isfinite(truth.speed_mps) & np.isfinite(truth.accel_mps2) & np.isfinite(truth.position_m)
-        self.compared += int(finite.sum())
-        self.position_square += float(((motion.position_m - truth.position_m)[finite] ** 2).sum())
-        self.speed_square += float(((motion.speed_mps - truth.speed_mps)[finite] ** 2).sum())
-        self.accel_error_square += float(((motion.accel_mps2 - truth.accel_mps2)[finite] ** 2).sum())
-
     def merge(self, other: Tally) -> None:
         """Add another tally, of another chunk."""
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)
 
     def row(self) -> dict[str, float | int]:
-        """Return the row of a report, without metrics that were not measured."""
+        """Return the row of a report."""
         mean = self.accel / self.samples if self.samples else float("nan")
         spread = max(self.accel_square / self.samples - mean * mean, 0.0) ** 0.5 if self.samples else float("nan")
-        row: dict[str, float | int] = {
+        return {
             "trajectories": self.tracks,
             "position_error_rate_percent": 100.0 * self.rate / self.moving if self.moving else float("nan"),
             "accel_mean_mps2": mean,
@@ -114,8 +102,3 @@ class Tally:
             "implausible_percent": 100.0 * self.implausible / self.tracks if self.tracks else float("nan"),
             "milliseconds_per_trajectory": 1e3 * self.seconds / self.tracks if self.tracks else float("nan"),
         }
-        if self.compared:
-            row["position_rmse_m"] = (self.position_square / self.compared) ** 0.5
-            row["speed_rmse_mps"] = (self.speed_square / self.compared) ** 0.5
-            row["accel_rmse_mps2"] = (self.accel_error_square / self.compared) ** 0.5
-        return row

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from idm_env.trajectories import baselines
+from benchmarks.trajectories import truth_errors
+from idm_env.trajectories.baselines import BASELINES, bounded_spline
 from idm_env.trajectories.scores import RegularMotion, Tally, from_positions, implausible, position_error_rate
 
 CLOCK = np.arange(0, 60.05, 0.1)
@@ -19,36 +20,33 @@ def wave(clock: np.ndarray) -> RegularMotion:
     )
 
 
-@pytest.mark.parametrize("name", baselines.BASELINES)
+@pytest.mark.parametrize("name", BASELINES)
 def test_a_straight_line_is_kept_exactly(name: str) -> None:
     line = 5.0 + 10.0 * CLOCK
-    motion = baselines.run(name, CLOCK, line, CLOCK)
+    motion = BASELINES[name](CLOCK, line, CLOCK)
     assert np.allclose(motion.position_m, line, atol=1e-3)
     assert np.allclose(motion.speed_mps, 10.0, atol=1e-3)
     assert np.allclose(motion.accel_mps2, 0.0, atol=2e-2)
 
 
-@pytest.mark.parametrize("name", [name for name in baselines.BASELINES if name != "linear"])
+@pytest.mark.parametrize("name", [name for name in BASELINES if name != "linear"])
 def test_every_smoother_beats_straight_lines_on_noise(name: str) -> None:
     rng = np.random.default_rng(0)
     truth = wave(CLOCK)
     noisy = truth.position_m + 0.3 * rng.normal(size=len(CLOCK))
     errors = {}
     for method in ("linear", name):
-        tally = Tally()
-        tally.compare(baselines.run(method, CLOCK, noisy, CLOCK), truth)
-        tally.add(truth, CLOCK, noisy)
-        errors[method] = tally.row()
+        errors[method] = truth_errors([(BASELINES[method](CLOCK, noisy, CLOCK), truth)])
     assert errors[name]["speed_rmse_mps"] < 0.5 * errors["linear"]["speed_rmse_mps"]
     assert errors[name]["accel_rmse_mps2"] < 0.5 * errors["linear"]["accel_rmse_mps2"]
 
 
-@pytest.mark.parametrize("name", baselines.BASELINES)
+@pytest.mark.parametrize("name", BASELINES)
 @pytest.mark.parametrize("count", [2, 3, 5])
 def test_short_tracks_have_a_motion(name: str, count: int) -> None:
     time = np.arange(count) * 1.0
     clock = np.arange(0, time[-1] + 0.05, 0.1)
-    motion = baselines.run(name, time, 3.0 * time, clock)
+    motion = BASELINES[name](time, 3.0 * time, clock)
     assert np.isfinite(motion.accel_mps2).all()
     assert np.allclose(motion.speed_mps, 3.0, atol=0.1)
 
@@ -56,8 +54,8 @@ def test_short_tracks_have_a_motion(name: str, count: int) -> None:
 def test_the_bounded_spline_keeps_its_bounds_where_the_free_one_breaks_them() -> None:
     time = np.arange(0, 20.0, 1.0)
     position = np.where(time < 10, 15 * time, 150.0)  # an instant stop
-    motion = baselines.bounded_spline(time, position, np.arange(0, 19.05, 0.1), 1.0, 4.0)
-    free = baselines.bounded_spline(time, position, np.arange(0, 19.05, 0.1), 1.0, 1e3)
+    motion = bounded_spline(time, position, np.arange(0, 19.05, 0.1), 1.0, 4.0)
+    free = bounded_spline(time, position, np.arange(0, 19.05, 0.1), 1.0, 1e3)
     assert np.abs(free.accel_mps2).max() > 4.0
     assert np.abs(motion.accel_mps2).max() <= 4.0
     assert motion.speed_mps.min() >= -1e-6
@@ -66,7 +64,7 @@ def test_the_bounded_spline_keeps_its_bounds_where_the_free_one_breaks_them() ->
 def test_long_splines_are_blended_from_blocks() -> None:
     clock = np.arange(0, 400.05, 0.1)
     truth = wave(clock)
-    whole = baselines.bounded_spline(clock, truth.position_m, clock)
+    whole = bounded_spline(clock, truth.position_m, clock)
     assert np.abs(whole.speed_mps - truth.speed_mps).max() < 0.02
 
 

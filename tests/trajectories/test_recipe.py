@@ -7,8 +7,9 @@ import polars as pl
 import pytest
 import torch
 
+from benchmarks.trajectories import TUNED, truth_errors
 from idm_env.effects.idm import gap_for
-from idm_env.trajectories import baselines
+from idm_env.trajectories.baselines import BASELINES
 from idm_env.trajectories.drivers import parameter_rows
 from idm_env.trajectories.imagined import CAPABLE, drive
 from idm_env.trajectories.noise import fit_noise
@@ -233,22 +234,22 @@ def test_it_beats_every_tuned_baseline_on_measured_vehicles(measured) -> None:  
         tally = Tally()
         for track, motion in zip(tracks, motions, strict=True):
             tally.add(motion, track.time_s, track.position_m)
-            tally.compare(motion, truth_of(track, clean))
-        return tally.row()
+        pairs = zip(motions, (truth_of(track, clean) for track in tracks), strict=True)
+        return tally.row() | truth_errors(pairs)
 
     noise = fit_noise([(t.time_s, t.position_m) for t in first], 0.1)
     ours: list[Filtered] = recipe(second, 0.1, noise)
     row = score(second, [f.motion for f in ours])
     assert row["implausible_percent"] == 0.0
     assert overlaps(ours)[1] == 0
-    for name in baselines.BASELINES:
-        choices = baselines.BASELINES[name][1]
+    for name, smoother in BASELINES.items():
+        choices = TUNED[name]
         rows = []
         for choice in choices:
-            motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), **choice) for t in first[::3]]
+            motions = [smoother(t.time_s, t.position_m, clock_of(t, 0.1), **choice) for t in first[::3]]
             rows.append(score(first[::3], motions))
         for what in ("speed_rmse_mps", "accel_rmse_mps2"):
             # tuned for each figure by itself, which no single smoother could be
             best = choices[min(range(len(rows)), key=lambda i: rows[i][what])]
-            motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), **best) for t in second]
+            motions = [smoother(t.time_s, t.position_m, clock_of(t, 0.1), **best) for t in second]
             assert row[what] < score(second, motions)[what], (name, best, what)
