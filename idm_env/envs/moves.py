@@ -15,10 +15,8 @@ from torch import Tensor
 
 from idm_env.envs.settings import Settings
 from idm_env.tasks import EnvState
+from idm_env.tasks.types import Maybe, Normals
 from idm_env.types import Params, worthwhile
-
-Maybe = Tensor | None
-Normals = Mapping[str, Tensor] | None
 
 
 class Moves:

@@ -184,7 +184,6 @@ def space_time(
 def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = None, columns: int | None = None) -> Any:
     """Return a matplotlib figure of panels, in one column up to three of them, else in two; not yet ``legible``."""
     with needed("a diagram"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.collections import LineCollection
         from matplotlib.colors import LinearSegmentedColormap
         from matplotlib.figure import Figure
@@ -192,7 +191,6 @@ def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = N
     rows = max(1, -(-len(drawn) // columns))
     height = 4.8 if rows == 1 else 0.8 + 3.0 * rows
     figure = Figure(figsize=(9.0 if columns == 1 else 12.0, height), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     top = fastest or _fastest(drawn)
     scale = LinearSegmentedColormap.from_list("speed", COLOURS / 255.0)

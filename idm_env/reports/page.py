@@ -157,11 +157,9 @@ def _encoded(figure: Figure) -> str:
 def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (9.0, 3.4)) -> tuple[Figure, Any]:
     """Return a figure and its axes ([rows, columns] array) without a display; ImportError names the extra."""
     with needed("a report"):
-        import matplotlib
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+        from matplotlib.figure import Figure
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
 
 
 def write_page(

@@ -57,11 +57,9 @@ def fundamental_diagram(
         ValueError: If no cell is whole, or a table lacks a column.
     """
     with needed("a diagram"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     density, flow = edie(panels_of(data, dt=dt, ring_length=ring_length), seconds=seconds, metres=metres)
     figure = Figure(figsize=(6.0, 4.2), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.plot(1000.0 * density, 3600.0 * flow, "o", ms=4.0, alpha=0.7, color="#0b5fa5")
     axes.set(xlabel="density (vehicles/km)", ylabel="flow (vehicles/h)", xlim=(0.0, None), ylim=(0.0, None))
@@ -82,13 +80,11 @@ def animate(data: Any, *, dt: float = 0.1, ring_length: float | None = None, eve
     """
     with needed("an animation"):
         from matplotlib.animation import FuncAnimation
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.colors import LinearSegmentedColormap
         from matplotlib.figure import Figure
     panel = panels_of(data, dt=dt, ring_length=ring_length)[0]
     ring = panel.ring_length
     figure = Figure(figsize=(5.0, 4.0) if ring else (8.0, 2.0), dpi=80, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     times = np.arange(min(x.time[0] for x in panel.lines), max(x.time[-1] for x in panel.lines), every)
     top = max(1.0, max(float(line.speed.max()) for line in panel.lines))

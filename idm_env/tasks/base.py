@@ -29,7 +29,7 @@ from idm_env.tasks.failsafe import safe_accel
 from idm_env.tasks.features import FEATURES, AgentView, Feature, ObservedFeature, chosen
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition, Weighted, weighted
-from idm_env.tasks.types import Bounds, Ended, EnvState, Features, RewardRange
+from idm_env.tasks.types import Bounds, Ended, EnvState, Maybe, Normals, RewardRange
 from idm_env.types import Command, Inputs, Params, State, mapped
 from idm_env.validation import nearest, whole
 
@@ -273,21 +273,16 @@ class Task(abc.ABC):
         return self._observation[1] or tuple(ObservedFeature(each) for each in self.own_features)
 
     @cached_property
-    def features(self) -> Features:
-        """What one agent observes, in SI units."""
-        each = [(x.name, x.feature.scale, x.feature.low, x.feature.high) for x in self.observed]
-        return Features(*zip(*each, strict=True))
-
-    @cached_property
     def scales(self) -> tuple[float, ...]:
         """What each entry of an observation is divided by: 1 for raw ones."""
-        return self.features.scales if self.scaling == "scaled" else (1.0,) * len(self.features.scales)
+        return tuple(x.feature.scale if self.scaling == "scaled" else 1.0 for x in self.observed)
 
     @cached_property
     def bounds(self) -> Bounds:
         """The space of observations: they are clipped to it, and what is clipped has no gradient."""
-        low, high = (tuple(x / scale for x, scale in zip(ends, self.scales, strict=True)) for ends in self.features[2:])
-        return Bounds(self.features.names, low, high)
+        each = zip(self.observed, self.scales, strict=True)
+        entries = ((x.name, x.feature.low / scale, x.feature.high / scale) for x, scale in each)
+        return Bounds(*zip(*entries, strict=True))
 
     def by_name(self, observation: Tensor) -> dict[str, Tensor]:
         """Return an observation ``(…, agents · features)`` by the name of each feature: ``(…, agents)`` in SI units."""
@@ -530,9 +525,7 @@ class Task(abc.ABC):
         """Return commands (m/s²) as far as the failsafe lets them pass."""
         return torch.minimum(command, self.safe_command(world)) if self.failsafe else command
 
-    def inputs(
-        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
-    ) -> Inputs:
+    def inputs(self, world: EnvState, command: Maybe, normals: Normals, live: Maybe = None) -> Inputs:
         """Return the inputs of one step: the command (m/s², None for nobody) and the normals of effects that draw.
 
         ``live`` (bool, ``(…, agents)``) says which agents still command; the others' vehicles go back to their drivers.
@@ -551,13 +544,11 @@ class Task(abc.ABC):
             inputs = {"control": Command(command, active)}
         return {**inputs, **(normals or {})}
 
-    def with_lane_commands(self, inputs: Inputs, action: Tensor | None, live: Tensor | None = None) -> Inputs:
+    def with_lane_commands(self, inputs: Inputs, action: Maybe, live: Maybe = None) -> Inputs:
         """Return the inputs of a step with the agents' lane commands, if they have any."""
         return inputs
 
-    def step(
-        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, params: Params
-    ) -> EnvState:
+    def step(self, world: EnvState, command: Maybe, normals: Normals, params: Params) -> EnvState:
         """Return the world Δt later. ``command`` (m/s²) is ``(…, agents)``, each of ``normals`` ``(…, vehicles)``."""
         if command is not None:
             command = self.limit(world, command)
@@ -635,4 +626,4 @@ class Task(abc.ABC):
         return (seen / self.constant("scales", lambda: self.scales, device, dtype)).clamp(low, high)
 
 
-__all__ = ["Bounds", "Draw", "Ended", "EnvState", "Features", "RewardRange", "Task"]
+__all__ = ["Bounds", "Draw", "Ended", "EnvState", "RewardRange", "Task"]

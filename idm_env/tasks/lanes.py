@@ -16,6 +16,7 @@ from idm_env.tasks.checks import Range
 from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition
+from idm_env.tasks.types import Maybe, Normals
 from idm_env.types import Inputs, Params, State
 
 FASTEST = 40.0
@@ -118,16 +119,14 @@ class LanesTask(Task):
         room = self.pick(self.road.closed_at(state.lanes.lane, state.position) - state.position)
         return torch.minimum(highest, self._safe_behind(state, torch.zeros_like(room), room))
 
-    def inputs(
-        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
-    ) -> Inputs:
+    def inputs(self, world: EnvState, command: Maybe, normals: Normals, live: Maybe = None) -> Inputs:
         """Return the inputs of one step, in which lanes are left to the drivers."""
         inputs = super().inputs(world, command, normals, live)
         if self.lane_commands:
             inputs = {**inputs, "lane_command": torch.full_like(world.state.speed, torch.nan)}
         return inputs
 
-    def with_lane_commands(self, inputs: Inputs, action: Tensor | None, live: Tensor | None = None) -> Inputs:
+    def with_lane_commands(self, inputs: Inputs, action: Maybe, live: Maybe = None) -> Inputs:
         """Return the inputs with the lanes that agents command."""
         if not self.lane_commands or action is None:
             return inputs

@@ -14,6 +14,7 @@ from idm_env.effects import Control, Effect, Replay
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.tasks.base import EnvState, Task
 from idm_env.tasks.random import Draw
+from idm_env.tasks.types import Maybe, Normals
 from idm_env.types import Inputs, Params, Record
 
 _TRACE_STREAM, _START_STREAM = 11, 12
@@ -115,9 +116,7 @@ class BehindHeadTask(Task):
         state = self.simulator.state(positions, speed, params, length=self.vehicle_length, step=step)
         return EnvState(state, episode)
 
-    def inputs(
-        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
-    ) -> Inputs:
+    def inputs(self, world: EnvState, command: Maybe, normals: Normals, live: Maybe = None) -> Inputs:
         """Return the inputs of one step, with the head's motion at its end."""
         state = world.state
         first = self.constant("first", lambda: np.arange(self.vehicles) == 0, state.speed.device, torch.bool)

@@ -20,7 +20,7 @@ from idm_env.tasks.follow import HIGHEST, KNEE, LOWEST, SEEN
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import RewardTerm, Transition, headway_penalty
 from idm_env.tasks.scenes import Scene, made_up_scene, recorded_scene
-from idm_env.tasks.types import NOBODY
+from idm_env.tasks.types import NOBODY, Maybe, Normals
 from idm_env.types import Inputs, Params, Record
 from idm_env.validation import nearest, shown
 
@@ -230,9 +230,7 @@ class ReplayTask(Task):
         inside = time.clamp(0, len(motion) - 1)
         return motion[inside], present[inside]
 
-    def inputs(
-        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
-    ) -> Inputs:
+    def inputs(self, world: EnvState, command: Maybe, normals: Normals, live: Maybe = None) -> Inputs:
         """Return the inputs of one step, with the record at its end; who is not there yet is placed by it."""
         inputs = dict(super().inputs(world, command, normals, live))
         state = world.state

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -18,6 +17,7 @@ from idm_env.tasks.features import FEATURES, Feature, feature
 from idm_env.tasks.lane_scenes import LanesScene, made_up_lanes, recorded_lanes
 from idm_env.tasks.lanes import FASTEST, LanesTask
 from idm_env.tasks.replay import ReplayTask
+from idm_env.tasks.types import Maybe, Normals
 from idm_env.types import Inputs, State
 from idm_env.validation import one_of
 
@@ -95,9 +95,7 @@ class ReplayLanesTask(ReplayTask, LanesTask):
         lane = self.constant("lane", self.scene.lane, time.device, torch.int64)
         return lane[time.clamp(0, len(lane) - 1)]
 
-    def inputs(
-        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
-    ) -> Inputs:
+    def inputs(self, world: EnvState, command: Maybe, normals: Normals, live: Maybe = None) -> Inputs:
         """Return the inputs of one step, with the record at its end, lanes included where they are recorded."""
         inputs = dict(super().inputs(world, command, normals, live))
         state = world.state

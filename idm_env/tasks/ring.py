@@ -17,6 +17,7 @@ from idm_env.tasks.checks import Range, span
 from idm_env.tasks.features import Feature, feature
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition
+from idm_env.tasks.types import Maybe, Normals
 from idm_env.types import Command, Inputs, Params, State
 from idm_env.validation import at_least, one_of, shown
 
@@ -197,9 +198,7 @@ class RingTask(Task):
             return x[..., self._leaders[0] : self._leaders[0] + 1]
         return x.index_select(-1, self.constant("leaders", self._leaders, x.device, torch.int64))
 
-    def inputs(
-        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
-    ) -> Inputs:
+    def inputs(self, world: EnvState, command: Maybe, normals: Normals, live: Maybe = None) -> Inputs:
         """Return the inputs of one step: those of every task, and the command of the human who brakes."""
         inputs = super().inputs(world, command, normals, live)
         if "shock_step" not in world.episode:

@@ -11,6 +11,9 @@ from torch import Tensor
 from idm_env.roads import Road
 from idm_env.types import State
 
+Maybe = Tensor | None
+Normals = Mapping[str, Tensor] | None
+"""Standard normals of a step, by the effect that draws them."""
 NOBODY = "—"
 """Id of a slot in which no recorded vehicle is."""
 
@@ -59,15 +62,6 @@ class Ended(NamedTuple):
 
     terminated: Tensor
     truncated: Tensor
-
-
-class Features(NamedTuple):
-    """What one agent observes, in SI units: names, fixed scales, and the lowest and the highest value of each."""
-
-    names: tuple[str, ...]
-    scales: tuple[float, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
 
 
 class Bounds(NamedTuple):

@@ -121,7 +121,7 @@ def test_objects_of_ones_own_and_what_they_must_be():
     task = make_task("follow", observation={"features": [wavy]}, reward={bonus: 0.5})
     worlds = wild(task)
     assert AgentView(task, worlds[0]).state is worlds[0].state and Transition(task, *worlds).view.ahead == 0
-    assert task.features.names == ("wave",) and bool((paid(task, *worlds) == 0.5).all())
+    assert task.bounds.names == ("wave",) and bool((paid(task, *worlds) == 0.5).all())
     with pytest.raises(ValueError, match="low below its high"):
         Feature("flat", "", "", 1.0, 1.0, 1.0, wavy.read)
     with pytest.raises(ValueError, match="low below its high"):

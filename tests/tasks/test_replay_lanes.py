@@ -137,7 +137,7 @@ def test_the_leader_is_whoever_is_ahead_on_the_lane_now(road):
         assert ids[leader] == ("r/b" if t < 30 else "r/d")
         gap = float(state.position[0, leader] - 5.0 - state.position[0, own])
         assert float(state.gap[0, own]) == pytest.approx(gap, abs=1e-9)
-        seen = dict(zip(task.features.names, task.observe(world)[0, 0].tolist(), strict=True))
+        seen = dict(zip(task.bounds.names, task.observe(world)[0, 0].tolist(), strict=True))
         assert 100.0 * seen["gap"] == pytest.approx(gap, abs=1e-9)
         assert 20.0 * seen["lead_speed"] == pytest.approx(float(state.speed[0, leader]), abs=1e-9)
 
