@@ -32,12 +32,12 @@ from idm_env.prediction.scene import MapScene
 from idm_env.trajectories import paper
 from idm_env.trajectories.baselines import BASELINES
 from idm_env.trajectories.noise import SPARSE_WHITE_M, fit_noise
-from idm_env.trajectories.recipe import clock_of, overlaps, recipe
+from idm_env.trajectories.recipe import overlaps, recipe
 from idm_env.trajectories.report import before_and_after
 from idm_env.trajectories.scores import RegularMotion, Tally
 from idm_env.trajectories.smoother import SPARSE
 from idm_env.trajectories.spool import read_table
-from idm_env.trajectories.tracks import Pieces, TrackPiece
+from idm_env.trajectories.tracks import Pieces, TrackPiece, clock_of
 
 RAW, CLEAN = "ngsim_i80_rawlike.csv.gz", "ngsim_i80_lanes.parquet"
 FILES = {

@@ -23,7 +23,7 @@ MODULES = (
     "idm_env.cli.commands", "idm_env.fitting.job", "idm_env.fitting.lane_changes", "idm_env.discovery.sets",
     "idm_env.drift.job", "idm_env.trajectories.files", "idm_env.prediction.files",
     "idm_env.reports.diagrams",
-    "idm_env.compiled.kernels.dispatch", "idm_env.compiled.kernels.drivers", "idm_env.compiled.kernels.descent",
+    "idm_env.compiled.kernels.dispatch", "idm_env.compiled.kernels.drivers",
     "idm_env.model_file",
 )  # fmt: skip
 

@@ -20,7 +20,7 @@ from idm_env.prediction import report as written
 from idm_env.prediction.drivers import NAMES
 from idm_env.prediction.metrics import Case, Score, intervals, score, shape_of, summary
 from idm_env.prediction.pictures import scene_picture
-from idm_env.prediction.predict import METHODS, Prediction, available
+from idm_env.prediction.predict import METHODS, Prediction
 from idm_env.prediction.scene import MapScene
 from idm_env.reports import page
 
@@ -46,8 +46,8 @@ def predict_files(
     Writes ``predictions.parquet`` (one row per future and step), ``parameters.parquet`` (mean and deviation of each
     driver's five), ``report.json`` and ``report.html`` with the benchmark's metrics where the future is known, over
     all agents, per scene and per kind, against the single futures of ``METHODS``. A file or an agent that cannot be
-    used is left out and counted; the others are done. Without numba the paper's row is absent. ``resume`` goes on after
-    the last finished file. Files are done by ``executor`` (None: here), on which no prediction depends.
+    used is left out and counted; the others are done. ``resume`` goes on after the last finished file. Files are done
+    by ``executor`` (None: here), on which no prediction depends.
 
     Raises:
         DataError: If no file holds a scenario that can be used, or ``resume`` finds a run on other files or settings.
@@ -65,8 +65,8 @@ def _predict_files(
     counts = [count(path) for path in files]
     everything = sum(counts)
     numbers = [number for number in range(len(files)) if not parts.done(number)]
-    methods, before_each = tuple(available()), [sum(counts[:number]) for number in range(len(files))]
-    jobs = [_Job(parts, n, files[n].absolute(), methods, before_each[n], everything) for n in numbers]
+    before_each = [sum(counts[:number]) for number in range(len(files))]
+    jobs = [_Job(parts, n, files[n].absolute(), before_each[n], everything) for n in numbers]
     before = everything - sum(counts[job.number] for job in jobs)
     if before:
         progress("predict", before, everything, "")
@@ -90,12 +90,11 @@ def _predict_files(
 
 
 class _Job(NamedTuple):
-    """One file to predict: where its part is kept, by which methods, and how many scenarios there are before it."""
+    """One file to predict: where its part is kept, and how many scenarios there are before it."""
 
     parts: Parts
     number: int
     path: Path
-    methods: tuple[str, ...]
     before: int
     everything: int
 
@@ -124,7 +123,7 @@ def _predict_file(job: _Job, progress: OnProgress) -> None:
         scene = MapScene(scenario)
         notes += [{"scenario": scenario.id, "note": note} for note in _notes(scenario)]
         for index in scenario.to_predict:
-            if (done := _agent(scene, index, job.methods, left_out)) is None:
+            if (done := _agent(scene, index, left_out)) is None:
                 continue
             ours = done[OURS]
             tables.append(_rows(scenario, ours))
@@ -158,12 +157,10 @@ def _notes(scenario: Scenario) -> list[str]:
     return notes
 
 
-def _agent(
-    scene: MapScene, index: int, methods: Sequence[str], left_out: list[dict[str, str]]
-) -> dict[str, Prediction] | None:
+def _agent(scene: MapScene, index: int, left_out: list[dict[str, str]]) -> dict[str, Prediction] | None:
     """Predict one agent by every method; None, and counted, where it cannot be."""
     try:
-        return {name: METHODS[name](scene, index) for name in methods}
+        return {name: method(scene, index) for name, method in METHODS.items()}
     except ValueError as error:
         left_out.append({"what": f"{scene.scenario.id}, track {index}", "reason": str(error)})
         return None

@@ -1,18 +1,18 @@
 """Futures of the agents of a scenario: several by fitted drivers on routes, and single ones to compare them with."""
 
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 
 import numpy as np
 
 from idm_env.effects import IDM
-from idm_env.prediction.drivers import posterior
+from idm_env.prediction.drivers import Second, posterior
 from idm_env.prediction.free import constant_velocity, free_futures, kept_velocity
 from idm_env.prediction.lanes import Route
 from idm_env.prediction.mixture import SHARES, Shares, share_of
-from idm_env.prediction.rollout import DT, Course, RouteDrivers, roll
+from idm_env.prediction.rollout import DT, Course, RouteDrivers, RouteLeader, roll
 from idm_env.prediction.scene import STEPS, MapScene
 from idm_env.prediction.select import select
+from idm_env.trajectories import paper
 
 LATERAL_S = 4.0
 """Time in which a vehicle returns to the middle of its lane (s)."""
@@ -135,30 +135,48 @@ def as_published(scene: MapScene, index: int) -> Prediction:
 
 def published_distance(scene: MapScene, index: int, cache: dict[int, np.ndarray]) -> np.ndarray:
     """Return how far an agent goes by the paper's recipe at every step [S] (m); ``cache`` holds those worked out."""
-    from idm_env.trajectories import paper
-
     if index in cache:
         return cache[index]
     agent = scene.scenario.agents[index]
     speed = scene.speed(agent)
     # entered first: who is not on a lane, and who closes a circle of leaders, goes on at this speed
     cache[index] = speed * DT * np.arange(1, STEPS + 1)
-    routes = scene.routes(agent)
-    if not routes:
+    _fit_as_published(scene, index)
+    if (driver := scene.published[index]) is None:
         return cache[index]
-    route, front = routes[0], 0.5 * agent.length
-    leader = scene.leader(index, route)
-    past, future = scene.leader_motion(index, route)
+    second, future, values = driver
+    leader = scene.leader(index, second.route)
     if leader is not None:
         gone = np.concatenate([[0.0], published_distance(scene, leader[0], cache)])
-        future = type(future)(past.rear[-1] + gone, np.gradient(gone, DT))
-    second = scene.second(agent, route, past)
-    own = route.begin + front - second.distance_to_present
-    values = paper.START.copy()
-    if len(second.speeds) > 1:
-        values = paper.follow(own, float(second.speeds[0]), second.ahead.rear, second.ahead.speed, DT)
-    cache[index] = paper.drive(values, speed, future.rear - route.begin - front, future.speed, DT)[1:]
+        future = RouteLeader(second.ahead.rear[-1] + gone, np.gradient(gone, DT))
+    begin = second.route.begin + second.front
+    cache[index] = paper.drive(values, speed, future.rear - begin, future.speed, DT)[1:]
     return cache[index]
+
+
+def _fit_as_published(scene: MapScene, index: int) -> None:
+    """Fit an agent, all that are to be predicted, and their leaders, together: what is done once for a scene."""
+    waiting = [] if index in scene.published else [index, *scene.scenario.to_predict]
+    seconds: dict[int, tuple[Second, RouteLeader]] = {}
+    for each in waiting:
+        agent = scene.scenario.agents[each]
+        if each in scene.published or each in seconds or not agent.valid[scene.present]:
+            continue
+        scene.published[each] = None
+        for route in scene.routes(agent)[:1]:
+            past, future = scene.leader_motion(each, route)
+            seconds[each] = scene.second(agent, route, past), future
+            leader = scene.leader(each, route)
+            waiting += [] if leader is None else [leader[0]]
+    followed = [
+        paper.Followed(
+            second.route.begin + second.front - second.distance_to_present,
+            float(second.speeds[0]), second.ahead.rear, second.ahead.speed,
+        )
+        for second, _ in seconds.values()
+    ]  # fmt: skip
+    for each, values in zip(seconds, paper.follow(followed, DT) if followed else (), strict=True):
+        scene.published[each] = (*seconds[each], values)
 
 
 METHODS = {
@@ -168,8 +186,3 @@ METHODS = {
     "the paper's recipe": as_published,
 }
 """Name → function of a scene and an agent's index."""
-
-
-def available() -> list[str]:
-    """Return the names of the methods that can run here: the paper's recipe is compiled and needs numba."""
-    return [name for name in METHODS if METHODS[name] is not as_published or find_spec("numba") is not None]

@@ -37,6 +37,8 @@ class MapScene:
         self.scenario = scenario
         self.present = scenario.present
         self._travelled: dict[int, np.ndarray] = {}
+        self.published: dict[int, tuple[Second, RouteLeader, np.ndarray] | None] = {}
+        """Drivers by the paper's recipe, once fitted: last second, leader's future, five values; None off the lanes."""
 
     @cached_property
     def graph(self) -> LaneGraph:

@@ -12,10 +12,10 @@ from idm_env.jobs.shards import Parts
 from idm_env.trajectories import paper
 from idm_env.trajectories.baselines import BASELINES
 from idm_env.trajectories.drivers import parameter_rows
-from idm_env.trajectories.recipe import Filtered, clock_of, nearest, overlaps, recipe
+from idm_env.trajectories.recipe import Filtered, nearest, overlaps, recipe
 from idm_env.trajectories.scores import RegularMotion, Tally
 from idm_env.trajectories.smoother import SPARSE, PositionNoise, SmootherOptions
-from idm_env.trajectories.tracks import TrackPiece
+from idm_env.trajectories.tracks import TrackPiece, clock_of
 
 Recipe = Literal["default", "paper"]
 CHUNK = 200

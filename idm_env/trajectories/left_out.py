@@ -7,10 +7,10 @@ import numpy as np
 from idm_env.trajectories import paper
 from idm_env.trajectories.baselines import BASELINES
 from idm_env.trajectories.chunks import OURS, FilePlan, FilterSettings
-from idm_env.trajectories.recipe import clock_of, recipe
+from idm_env.trajectories.recipe import recipe
 from idm_env.trajectories.scores import RegularMotion
 from idm_env.trajectories.spool import Spool
-from idm_env.trajectories.tracks import Pieces, TrackPiece
+from idm_env.trajectories.tracks import Pieces, TrackPiece, clock_of
 
 VEHICLES = 120
 """Vehicles that are scored, at most, in blocks that follow one another so that leaders are among them."""

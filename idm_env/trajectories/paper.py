@@ -8,11 +8,9 @@ the imagined inputs: here the gap stays in [1, 10 000] m and the closing speed i
 put back into their bounds after every step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -21,20 +19,16 @@ from torch import Tensor
 from idm_env.effects import IDM, Brakes, ImaginedLeader
 from idm_env.effects.base import Effect, P
 from idm_env.roads import Lane
-from idm_env.simulator import Simulator
-from idm_env.trajectories.recipe import clock_of
+from idm_env.simulator import Simulator, Trajectory
 from idm_env.trajectories.scores import RegularMotion
-from idm_env.trajectories.tracks import TrackPiece
+from idm_env.trajectories.tracks import TrackPiece, clock_of
 from idm_env.types import Imagined, Neighbour, Scene
-
-if TYPE_CHECKING:
-    from idm_env.compiled.kernels.descent import Bounds, DescentResult
 
 NAMES = ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed")
 START = np.array([10.0, 2.0, 1.0, 5.0, 50.0])
 LOW = np.array([5.0, 0.1, 0.1, 1.0, 20.0])
 HIGH = np.array([10.0, 5.0, 5.0, 10.0, 60.0])
-FIVE = {f"idm.{name}": (low, high) for name, low, high in zip(NAMES, LOW.tolist(), HIGH.tolist(), strict=True)}
+FIVE = torch.as_tensor(LOW), torch.as_tensor(HIGH)
 GAP_BOUNDS = (1.0, 1e4)
 CLOSING_BOUNDS = (-100.0, 100.0)
 MAX_DECEL = 10.0
@@ -88,7 +82,7 @@ def imitate(
 ) -> list[Imitated]:
     """Fit each track by the published recipe; a data point is compared at the simulation step nearest in time.
 
-    ``fixed_parameters`` keeps the five at their initial values (the paper's ablation). ImportError without numba.
+    ``fixed_parameters`` keeps the five at their initial values (the paper's ablation).
     """
     clocks = [clock_of(track, dt) for track in tracks]
     by_length = sorted(range(len(tracks)), key=lambda i: len(clocks[i]))
@@ -112,63 +106,97 @@ def _imitated(
     ]
     speed0 = [max(0.0, x[1] / (track.time_s[1] - track.time_s[0])) for x, track in zip(targets, tracks, strict=True)]
     gap = torch.full((max(len(clock) for clock in clocks), len(tracks), 1), 10.0, dtype=torch.float64)
-    bounds = {"imagined.gap": GAP_BOUNDS, "imagined.closing_speed": CLOSING_BOUNDS} | ({} if fixed else FIVE)
     ahead = Imagined(gap, torch.zeros_like(gap))
-    start = np.tile(START, (len(tracks), 1))
-    driven = _descended(ImaginedLeader(), ahead, start, speed0, dt, steps, targets, bounds, iterations)
-    values = np.stack([driven.params[f"idm.{name}"] for name in NAMES], axis=-1)
+    values = torch.as_tensor(START).repeat(len(tracks), 1)
+    free = [(ahead.gap, *GAP_BOUNDS), (ahead.closing_speed, *CLOSING_BOUNDS)]
+    course = _Course(ImaginedLeader(), ahead, speed0, dt)
+    driven = course.fit(values, free if fixed else [(values, *FIVE), *free], steps, targets, iterations)
+    position, speed, accel = (x[..., 0].numpy() for x in driven[:3])
     fits = []
     for i, (track, clock) in enumerate(zip(tracks, clocks, strict=True)):
         own = slice(0, len(clock))
+        loss = float(np.abs(position[steps[i], i] - targets[i]).mean())
         # The acceleration of a step starts at its own speed.
-        position, speed, accel = driven.position[own, i], driven.speed[own, i], driven.accel[1:][own, i]
-        loss = float(np.abs(position[steps[i]] - targets[i]).mean())
-        motion = RegularMotion(clock, position + track.position_m[0], speed, accel)
-        fits.append(Imitated(motion, values[i], driven.inputs["imagined.gap"][own, i], loss))
+        columns = position[own, i] + track.position_m[0], speed[own, i], accel[1:][own, i]
+        fits.append(Imitated(RegularMotion(clock, *columns), values[i].numpy(), gap[own, i, 0].numpy(), loss))
     return fits
 
 
-def follow(
-    position_m: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float, iterations: int = ITERATIONS
-) -> np.ndarray:
-    """Return the five values fitted behind a real leader to positions [K] every ``dt`` (s), by the same optimisation.
+class Followed(NamedTuple):
+    """What a driver did behind a leader, every so many seconds [K], and at first.
 
-    This is the recipe of prediction: nothing is imagined. ``rear_m`` and ``pace`` [K] are the leader's rear bumper (m)
-    and speed (m/s), ``speed0`` the first speed (m/s).
+    ``position`` (m) is the front bumper's, ``rear`` (m) the leader's rear bumper, ``pace`` (m/s) the leader's speed,
+    ``speed0`` (m/s) the driver's first one.
     """
-    origin = position_m[0]
-    steps, target = np.arange(len(position_m)), position_m - origin
-    ahead = _record_ahead(rear_m - origin, pace)
-    result = _descended(RealLeader(), ahead, START[None], [speed0], dt, [steps], [target], FIVE, iterations)
-    return np.array([result.params[f"idm.{name}"][0] for name in NAMES])
+
+    position: np.ndarray
+    speed0: float
+    rear: np.ndarray
+    pace: np.ndarray
+
+
+def follow(drivers: Sequence[Followed], dt: float, iterations: int = ITERATIONS) -> np.ndarray:
+    """Return the five values [N, 5] of drivers, fitted to their positions every ``dt`` (s) by the same optimisation.
+
+    This is the recipe of prediction: nothing is imagined.
+    """
+    most, values = max(len(each.pace) for each in drivers), torch.as_tensor(START).repeat(len(drivers), 1)
+    columns = [(each.rear - each.position[0], each.pace) for each in drivers]
+    ahead = _leader_input([[np.pad(x, (0, most - len(x)), "edge") for x in pair] for pair in columns])
+    steps, targets = zip(*((np.arange(len(x)), x - x[0]) for x in (each.position for each in drivers)), strict=True)
+    course = _Course(RealLeader(), ahead, [each.speed0 for each in drivers], dt)
+    course.fit(values, [(values, *FIVE)], steps, targets, iterations)
+    return values.numpy()
 
 
 def drive(values: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float) -> np.ndarray:
-    """Return the distances [K] that the five values drive from 0 at ``speed0``, behind a leader as in ``follow``."""
-    ahead = _record_ahead(rear_m, pace)
-    return _descended(RealLeader(), ahead, values[None], [speed0], dt, [], [], {}, 0).position[:-1, 0]
+    """Return the distances [K] that the five values drive from 0 at ``speed0``, behind a leader as in ``Followed``."""
+    course = _Course(RealLeader(), _leader_input([(rear_m, pace)]), [speed0], dt)
+    return course.motion(torch.as_tensor(values)[None]).position[:-1, 0, 0].numpy()
 
 
-def _record_ahead(rear_m: np.ndarray, pace: np.ndarray) -> Ahead:
-    return Ahead(*(torch.as_tensor(np.asarray(x, float))[:, None, None] for x in (rear_m, pace)))
+def _leader_input(leaders: Sequence[Sequence[np.ndarray]]) -> Ahead:
+    """Return the input of rears and paces, each [K], of several leaders."""
+    return Ahead(*(torch.as_tensor(np.stack(columns, axis=1))[..., None] for columns in zip(*leaders, strict=True)))
 
 
-def _descended(
-    leader: Effect, ahead: Imagined | Ahead, values: np.ndarray, speed0: Sequence[float], dt: float,
-    steps: Sequence[np.ndarray], targets: Sequence[np.ndarray], bounds: Bounds, iterations: int,
-) -> DescentResult:  # fmt: skip
-    """Fit rows of ``values`` [N, 5] and of the input ``ahead`` (steps, N, 1) to distances at ``steps`` [N]."""
-    from idm_env.compiled.kernels.descent import Observed, descend
+class _Course:
+    """Drivers (rows) behind one kind of leader, whose input ``ahead`` (steps, rows, 1) may be moved, too."""
 
-    simulator = Simulator(Lane(), (IDM(sharpness=1.0), leader, Brakes(sharpness=1.0)), dt, "euler")
-    params: Any = simulator.defaults(dtype=torch.float64)
-    params["idm"] = dict(zip(NAMES, torch.as_tensor(values).T[..., None], strict=True))
-    params["brakes"]["max_decel"] = torch.tensor(MAX_DECEL, dtype=torch.float64)
-    speed = torch.tensor(speed0, dtype=torch.float64)[:, None]
-    state = simulator.state(torch.zeros_like(speed), speed, params)
-    sizes = [len(x) for x in steps]
-    step, row = np.concatenate([np.empty(0, np.int64), *steps]), np.repeat(np.arange(len(steps)), sizes)
-    weight = np.repeat([1.0 / size for size in sizes], sizes)
-    observed = Observed(step, row, np.concatenate([[], *targets]), weight)
-    call = simulator, state, {leader.name: ahead}, params, len(ahead[0]), observed, bounds
-    return descend(*call, iterations=iterations, rates=RATES)
+    def __init__(self, leader: Effect, ahead: Imagined | Ahead, speed0: Sequence[float], dt: float) -> None:
+        self._simulator = Simulator(Lane(), (IDM(sharpness=1.0), leader, Brakes(sharpness=1.0)), dt, "euler")
+        self._params: Any = self._simulator.defaults(dtype=torch.float64)
+        self._params["brakes"]["max_decel"] = torch.tensor(MAX_DECEL, dtype=torch.float64)
+        speed = torch.tensor(speed0, dtype=torch.float64)[:, None]
+        self._state = self._simulator.state(torch.zeros_like(speed), speed, self._params)
+        self._inputs, self._steps = {leader.name: ahead}, len(ahead[0])
+
+    def motion(self, values: Tensor) -> Trajectory:
+        """Return the motion of drivers with these values [N, 5], (steps + 1, rows, 1), the start first."""
+        params = {**self._params, "idm": dict(zip(NAMES, values.T[..., None], strict=True))}
+        _, later = self._simulator.rollout(self._state, self._inputs, params, self._steps)
+        first = (getattr(self._state, name) for name in Trajectory._fields)
+        return Trajectory(*(torch.cat((x[None], y)) for x, y in zip(first, later, strict=True)))
+
+    def fit(
+        self, values: Tensor, free: Sequence[tuple[Tensor, Any, Any]], steps: Sequence[np.ndarray],
+        targets: Sequence[np.ndarray], iterations: int,
+    ) -> Trajectory:  # fmt: skip
+        """Move tensors that are ``free`` between bounds, in place, so that distances at ``steps`` near ``targets``."""
+        sizes = [len(x) for x in steps]
+        place = torch.as_tensor(np.concatenate(steps)), torch.as_tensor(np.repeat(np.arange(len(steps)), sizes))
+        target = torch.as_tensor(np.concatenate(targets))
+        weight = torch.as_tensor(np.repeat([1.0 / size for size in sizes], sizes))
+        adam = torch.optim.Adam([x.requires_grad_() for x, _, _ in free])
+        for turn in range(iterations):
+            adam.param_groups[0]["lr"] = RATES[0] + (RATES[1] - RATES[0]) * turn / iterations
+            adam.zero_grad()
+            apart = self.motion(values).position[..., 0][place] - target
+            (weight * apart.abs()).sum().backward()
+            adam.step()
+            with torch.no_grad():
+                for x, low, high in free:
+                    x.clamp_(low, high)
+        for x, _, _ in free:
+            x.requires_grad_(False)
+        return self.motion(values)

@@ -14,7 +14,7 @@ from idm_env.data.columns import nearest_of
 from idm_env.trajectories.imagined import Driven, drive
 from idm_env.trajectories.scores import RegularMotion
 from idm_env.trajectories.smoother import PositionNoise, Smoothed, SmootherOptions, TrackObservations, smooth
-from idm_env.trajectories.tracks import TrackPiece
+from idm_env.trajectories.tracks import TrackPiece, clock_of
 
 SMALLEST_GAP_M = 0.1
 """Where two vehicles would overlap that did not before, they are held this far apart (m)."""
@@ -51,12 +51,6 @@ class Meeting:
     follower: int
     leader: int
     steps: np.ndarray
-
-
-def clock_of(track: TrackPiece, dt: float) -> np.ndarray:
-    """Return the regular clock of a track: from its first sample on, the last one included."""
-    steps = int(np.ceil((track.time_s[-1] - track.time_s[0]) / dt - 1e-6)) + 1
-    return track.time_s[0] + dt * np.arange(steps)
 
 
 def nearest(track: TrackPiece, clock: np.ndarray) -> np.ndarray:

@@ -55,6 +55,12 @@ class TrackPiece:
         return dataclasses.replace(self, piece=self.piece if piece is None else piece, **cut)
 
 
+def clock_of(track: TrackPiece, dt: float) -> np.ndarray:
+    """Return the regular clock [K] of a track (s): from its first sample on, the last one included."""
+    steps = int(np.ceil((track.time_s[-1] - track.time_s[0]) / dt - 1e-6)) + 1
+    return track.time_s[0] + dt * np.arange(steps)
+
+
 class Pieces:
     """Tracks of a table, in the order in which vehicles appear; ``left_out`` counts what could not be used.
 

@@ -9,8 +9,7 @@ import torch
 from diffidm import IDMLayer
 
 from idm_env.trajectories import paper
-from idm_env.trajectories.recipe import clock_of
-from idm_env.trajectories.tracks import TrackPiece
+from idm_env.trajectories.tracks import TrackPiece, clock_of
 
 FLOOR = torch.tensor(-paper.MAX_DECEL, dtype=torch.float64)
 Inputs = Callable[[int, torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]

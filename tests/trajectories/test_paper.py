@@ -10,8 +10,6 @@ from idm_env.trajectories.scores import implausible, position_error_rate
 from tests.trajectories.direct import behind, direct
 from tests.trajectories.tracks import swinging, track_of
 
-pytest.importorskip("numba", reason="the recipe is compiled")
-
 
 def test_settings_are_the_published_ones() -> None:
     assert paper.START.tolist() == [10, 2, 1, 5, 50]
@@ -26,7 +24,7 @@ def test_same_values_behind_a_real_leader_as_the_published_layer_s() -> None:
     pace = np.linspace(12.0, 4.0, 30)
     rear = 40.0 + np.concatenate([[0.0], np.cumsum(0.1 * pace[:-1])])
     target = np.cumsum(np.random.default_rng(5).uniform(0.4, 1.2, 30))
-    ours = paper.follow(target, 8.0, rear, pace, 0.1, iterations=60)
+    [ours] = paper.follow([paper.Followed(target, 8.0, rear, pace)], 0.1, iterations=60)
     assert np.allclose(ours, behind(target, 8.0, rear, pace, 0.1, 60), atol=1e-9)
     assert (np.abs(ours - paper.START) > 0.01).all()  # each of the five has moved
 
@@ -74,7 +72,7 @@ def test_prediction_s_fit_finds_the_driver_behind_a_real_leader() -> None:
     pace = np.linspace(12.0, 6.0, 101)
     rear = 20.0 + np.concatenate([[0.0], np.cumsum(pace[:-1] * 0.1)])
     truth = paper.drive(np.array([6.0, 2.5, 1.4, 3.0, 40.0]), 12.0, rear, pace, 0.1)
-    found = paper.follow(truth, 12.0, rear, pace, 0.1)
+    [found] = paper.follow([paper.Followed(truth, 12.0, rear, pace)], 0.1)
     assert (found >= paper.LOW).all() and (found <= paper.HIGH).all()
     again = paper.drive(found, 12.0, rear, pace, 0.1)
     first = paper.drive(paper.START, 12.0, rear, pace, 0.1)

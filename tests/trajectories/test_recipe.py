@@ -13,7 +13,7 @@ from idm_env.trajectories.baselines import BASELINES
 from idm_env.trajectories.drivers import parameter_rows
 from idm_env.trajectories.imagined import CAPABLE, drive
 from idm_env.trajectories.noise import fit_noise
-from idm_env.trajectories.recipe import Filtered, clock_of, overlaps, recipe
+from idm_env.trajectories.recipe import Filtered, overlaps, recipe
 from idm_env.trajectories.scores import RegularMotion, Tally
 from idm_env.trajectories.smoother import (
     SPARSE,
@@ -24,7 +24,7 @@ from idm_env.trajectories.smoother import (
     smooth,
 )
 from idm_env.trajectories.spool import read_table
-from idm_env.trajectories.tracks import Pieces, TrackPiece
+from idm_env.trajectories.tracks import Pieces, TrackPiece, clock_of
 from idm_env.types import Driver
 from tests.trajectories.tracks import swinging, track_of
 

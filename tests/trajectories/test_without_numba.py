@@ -1,4 +1,4 @@
-"""Where numba is not installed: filtering says so in one line, prediction does without the paper's row."""
+"""Where numba is not installed: filtering says so in one line, prediction runs by torch."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from idm_env.prediction.predict import METHODS
 from tests.prediction.test_womd import write_json
 from tests.trajectories.test_files import lane
 
@@ -44,9 +45,9 @@ def test_a_command_names_itself_and_the_extra(tmp_path: Path, name: str, work: s
     assert not (tmp_path / "out").exists()
 
 
-def test_prediction_goes_on_without_the_paper_s_row(tmp_path: Path) -> None:
+def test_prediction_goes_on_by_torch(tmp_path: Path) -> None:
     pytest.importorskip("google.protobuf", reason="protobuf is not installed")
     done = command("predict", write_json(tmp_path / "fork.json", wanted=[0, 1]), "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "out" / "report.json").read_text())["methods"]
-    assert [row["method"] for row in rows] == ["drivers on routes", "constant velocity", "lane, constant speed"]
+    assert [row["method"] for row in rows] == list(METHODS)
