@@ -55,28 +55,15 @@ def trips(
     for k, count in counts.items():
         if count < 1:
             raise ValueError(f"no slot for lane {k}: {flows[k]:g} vehicles an hour. Give more seconds, or more slots.")
-    departs, again, lane = evenly(flows, counts, first=1)
-    if slots is None:
-        again = [math.inf] * len(again)
+    departs, again, lane = list[float](), list[float](), list[int]()
+    for k, flow in flows.items():
+        interval, count = 3600.0 / flow, counts[k]
+        departs += [interval * (i + 1) for i in range(count)]
+        again += [math.inf if slots is None else interval * count] * count
+        lane += [k] * count
     none = torch.zeros(len(lane), dtype=torch.int64)
     begin, later = (torch.tensor(x, dtype=dtype) for x in (departs, again))
     return Trips(begin, later, torch.tensor(lane), torch.full((len(lane),), speed, dtype=dtype), none, none.clone())
-
-
-def evenly(
-    per_hour: Mapping[int, float], counts: Mapping[int, int], first: int
-) -> tuple[list[float], list[float], list[int]]:
-    """Return when the trips of so many slots of each lane begin (s), after how long again (s), and their lanes.
-
-    ``first`` is how many intervals the first trip of a lane waits.
-    """
-    departs, again, lane = list[float](), list[float](), list[int]()
-    for k, flow in per_hour.items():
-        each, count = 3600.0 / flow, counts[k]
-        departs += [each * (i + first) for i in range(count)]
-        again += [each * count] * count
-        lane += [k] * count
-    return departs, again, lane
 
 
 def spread(schedule: Trips, shape: tuple[int, ...]) -> Trips:

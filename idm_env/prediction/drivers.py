@@ -8,16 +8,16 @@ second does not tell stays as spread in the futures.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
-from scipy.stats import norm, qmc
+from scipy.stats import norm
 
 from idm_env.data import Episode, VehicleRecord as Recorded
 from idm_env.fitting.fit import fit
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.solver import normal
+from idm_env.prediction.free import quantiles
 from idm_env.prediction.lanes import Route
 from idm_env.prediction.mixture import STANDING_MPS
 from idm_env.prediction.rollout import DT, RouteDrivers, RouteLeader, bend_speed
@@ -86,13 +86,6 @@ class Second:
         """Distance to the present at every sample (m), falling to 0."""
         mean = 0.5 * (self.speeds[1:] + self.speeds[:-1]) * DT
         return np.asarray(np.concatenate([np.cumsum(mean[::-1])[::-1], [0.0]]))
-
-
-@lru_cache(maxsize=8)
-def quantiles(count: int, dimensions: int = 10) -> np.ndarray:
-    """Return evenly spread points [count, dimensions] of the unit cube, the same at every call."""
-    power = max(1, int(np.ceil(np.log2(count))))
-    return np.clip(qmc.Sobol(dimensions, seed=0).random_base2(power)[:count], 1e-3, 1 - 1e-3)
 
 
 def hypotheses(second: Second) -> list[DriverHypothesis]:
@@ -181,7 +174,7 @@ def _draw(
 ) -> tuple[RouteDrivers, np.ndarray]:
     """Return drivers around one fit, and their weights."""
     count = DRAWS[h.kind]
-    u = quantiles(count)
+    u = quantiles(count, 10, 0)
     values = np.exp(log_mode + norm.ppf(u[:, :5]) @ factor.T)
     desired, lateral = values[:, 4], LATERAL_MPS2 * np.exp(LATERAL_DEVIATION * norm.ppf(u[:, 5]))
     if h.bend:

@@ -23,14 +23,11 @@ WALK_S = (0.5, 4.0)
 """Time in which they do (s), from starters to runners who fall back."""
 
 
-@lru_cache(maxsize=1)
-def _quantiles() -> np.ndarray:
-    return np.asarray(qmc.Sobol(4, seed=1).random(DRAWS))
-
-
-@lru_cache(maxsize=1)
-def _near() -> np.ndarray:
-    return np.asarray(np.clip(qmc.Sobol(2, seed=2).random(KEEPING), 1e-3, 1 - 1e-3))
+@lru_cache(maxsize=16)
+def quantiles(count: int, dimensions: int, seed: int) -> np.ndarray:
+    """Return evenly spread points [count, dimensions] of the unit cube, the same at every call."""
+    power = max(1, int(np.ceil(np.log2(count))))
+    return np.clip(qmc.Sobol(dimensions, seed=seed).random_base2(power)[:count], 1e-3, 1 - 1e-3)
 
 
 def motion_now(agent: Agent, present: int, dt: float = 0.1) -> tuple[float, float, float, float]:
@@ -61,7 +58,7 @@ def free_futures(agent: Agent, present: int, steps: int, dt: float = 0.1) -> np.
     the yaw rate and a wandering of 0.2 to 0.35 rad; 15 % brake to a stop with 1 m/s². Of the pedestrians, 45 % go over
     to walking, ``v(t) = w + (v − w) e^(−t/τ)``.
     """
-    u = np.clip(_quantiles(), 1e-3, 1 - 1e-3)
+    u = quantiles(DRAWS, 4, 1)
     speed, direction, accel, turning = motion_now(agent, present, dt)
     time = dt * np.arange(1, steps + 1)
     faded = FADE_S * (1 - np.exp(-time / FADE_S))
@@ -92,7 +89,7 @@ def kept_velocity(agent: Agent, present: int, steps: int, dt: float = 0.1) -> np
     Walking people are predicted by it as well as by trained networks (Schöller et al. 2020), and who stands mostly
     stays. The spread is proportional to the speed, so that standing is exact.
     """
-    z = norm.ppf(_near())
+    z = norm.ppf(quantiles(KEEPING, 2, 2))
     z[0] = 0.0
     cos, sin = np.cos(KEEPING_ANGLE * z[:, 1]), np.sin(KEEPING_ANGLE * z[:, 1])
     x, y = agent.velocity[present]
