@@ -1,7 +1,7 @@
 """Official TFRecord files of scenarios, without TensorFlow: record framing, checksums, and a minimal message schema.
 
-Only the fields that prediction needs are declared; protobuf skips all others. Field numbers are those of the published
-``scenario.proto`` and ``map.proto`` of the Waymo Open Dataset.
+Only the fields that prediction needs are declared (``scenario.json``); protobuf skips all others. Field numbers are
+those of the published ``scenario.proto`` and ``map.proto`` of the Waymo Open Dataset.
 """
 
 import struct
@@ -19,53 +19,19 @@ MILE_PER_HOUR = 0.44704
 _KIND = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}
 _MASK = 0xA282EAD8
 
-MESSAGES: dict[str, tuple[tuple[str, int, str], ...]] = {
-    "ObjectState": (
-        ("center_x", 2, "double"), ("center_y", 3, "double"), ("length", 5, "float"), ("width", 6, "float"),
-        ("heading", 8, "float"), ("velocity_x", 9, "float"), ("velocity_y", 10, "float"), ("valid", 11, "bool"),
-    ),
-    "Track": (("id", 1, "int32"), ("object_type", 2, "int32"), ("states", 3, "*ObjectState")),
-    "MapPoint": (("x", 1, "double"), ("y", 2, "double")),
-    "LaneCenter": (
-        ("speed_limit_mph", 1, "double"), ("type", 2, "int32"), ("polyline", 8, "*MapPoint"),
-        ("exit_lanes", 10, "*int64"),
-    ),
-    "StopSign": (("lane", 1, "*int64"), ("position", 2, "MapPoint")),
-    "TrafficSignalLaneState": (("lane", 1, "int64"), ("state", 2, "int32"), ("stop_point", 3, "MapPoint")),
-    "DynamicMapState": (("lane_states", 1, "*TrafficSignalLaneState"),),
-    "MapFeature": (("id", 1, "int64"), ("lane", 3, "LaneCenter"), ("stop_sign", 7, "StopSign")),
-    "RequiredPrediction": (("track_index", 1, "int32"), ("difficulty", 2, "int32")),
-    "Scenario": (
-        ("timestamps_seconds", 1, "*double"), ("tracks", 2, "*Track"), ("scenario_id", 5, "string"),
-        ("dynamic_map_states", 7, "*DynamicMapState"), ("map_features", 8, "*MapFeature"),
-        ("current_time_index", 10, "int32"), ("tracks_to_predict", 11, "*RequiredPrediction"),
-    ),
-}  # fmt: skip
-"""Message → fields (name, number, type); ``*`` repeats."""
+SCHEMA = Path(__file__).with_name("scenario.json")
+"""The fields that are read, as a file descriptor in protobuf's JSON."""
 
 
 @lru_cache(maxsize=1)
 def messages() -> dict[str, Any]:
     """Return the message classes by name. ImportError where protobuf is not installed."""
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+    from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
 
-    kinds = descriptor_pb2.FieldDescriptorProto
-    names = ("double", "float", "int32", "int64", "bool", "string")
-    scalars = {name: getattr(kinds, f"TYPE_{name.upper()}") for name in names}
-    file = descriptor_pb2.FileDescriptorProto(name="idm_env/scenario.proto", package="idm_env.womd", syntax="proto2")
-    for name, fields in MESSAGES.items():
-        message = file.message_type.add(name=name)
-        for field, number, kind in fields:
-            plain = kind.lstrip("*")
-            entry = message.field.add(name=field, number=number)
-            entry.label = kinds.LABEL_REPEATED if kind != plain else kinds.LABEL_OPTIONAL
-            if plain in scalars:
-                entry.type = scalars[plain]
-            else:
-                entry.type, entry.type_name = kinds.TYPE_MESSAGE, f".idm_env.womd.{plain}"
+    file = json_format.Parse(SCHEMA.read_text(encoding="utf-8"), descriptor_pb2.FileDescriptorProto())
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    kinds = {name: pool.FindMessageTypeByName(f"idm_env.womd.{name}") for name in MESSAGES}
+    kinds = pool.FindFileByName(file.name).message_types_by_name
     return {name: message_factory.GetMessageClass(kind) for name, kind in kinds.items()}
 
 
