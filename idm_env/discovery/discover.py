@@ -88,22 +88,22 @@ def discover(
         raise ValueError(f"no candidate can be tried on these data ({why}). Name others, or leave out --effects.")
     refuse_nan(prepared.episodes, law, tried)
     fit_runs, test_runs = _split(prepared, lockbox, seed)
+    if out is not None:
+        options = (list(map(repr, tried)), tuple(known), seed, located, lockbox, repr(law))
+        mark = storage.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
+        prepared = replace(prepared, kept=storage.Store(out / storage.UNFINISHED / "explain", mark, resume))
     rows = records.windows(prepared.of_runs(fit_runs))
     # Profiles over places as the file gives them.
     known_terms = tuple(terms.known_profile(n, *_profile(prepared, ALL[n].column), prepared.period) for n in known)
     own = [e for e in tried if e.kind not in PACKAGED or e != make(e.kind)]
     extra = [*own, *(terms.known_effect(term) for term in known_terms)]
-    options = (list(map(repr, tried)), tuple(known), seed, located, lockbox, repr(law))
     test = prepared.of_runs(test_runs) if test_runs else None
-    stores = []
 
-    def searched(bare: Hypothesis, part: str, errors: Judged | None = None) -> tuple[Evaluation, Decided]:
+    def searched(bare: Hypothesis, errors: Judged | None = None) -> tuple[Evaluation, Decided]:
         """Return what is found beyond a model, which is calibrated and judged as the null: ``errors``, where it is."""
-        mark = storage.fingerprint(prepared.groups, prepared.runs, (*options, part), prepared.signals)
-        stores.append(storage.Store(None if out is None else out / storage.UNFINISHED / part, mark, resume))
         problem = Problem(rows, noise.first_noise(rows), calibrate.first_prior(bare.catalogue.own))
         others = [name for name in names if name not in bare.catalogue.personal]
-        searching = Search(problem, others, located and effects is None, stores[-1], progress, bare)
+        searching = Search(problem, others, located and effects is None, progress, bare)
         progress("null", 0, 0, bare.catalogue.base.title)
         values = search.starting_values(bare)
         null = searching.null(bare, judge.unweighed(rows.records, bare, values, problem.prior)[1], values)
@@ -111,7 +111,7 @@ def discover(
         progress("final check", 0, 0, "test set")
         return Evaluation(searching, decided.null, prepared, test, by == "driver", seed, errors), decided
 
-    evaluation, decided = searched(Hypothesis(known_terms, march.Catalogue.of(extra, prepared.period, law)), "explain")
+    evaluation, decided = searched(Hypothesis(known_terms, march.Catalogue.of(extra, prepared.period, law)))
     try:
         discovery = finished(trajectories, evaluation, decided, refused, by, partial(progress, "other laws"), searched)
     except Exception as error:
@@ -119,8 +119,8 @@ def discover(
             path = write_search(out, decided, prepared, by)
             error.add_note(f"What the search saw is in {path}; with --resume it need not search again.")
         raise
-    for store in stores:
-        store.remove()
+    if prepared.kept is not None:
+        prepared.kept.remove()
     return discovery
 
 

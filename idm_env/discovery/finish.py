@@ -63,7 +63,7 @@ class Discovery:
         return self.models["model.yaml"]
 
 
-Searched = Callable[[Hypothesis, str, judge.Judged | None], tuple[Evaluation, Decided]]
+Searched = Callable[[Hypothesis, judge.Judged | None], tuple[Evaluation, Decided]]
 
 
 def finished(
@@ -79,7 +79,7 @@ def finished(
         refused: Why candidates could not be tested, by name.
         by: Who shares parameters.
         on_law: Called before each law that is compared, with its number, how many there are, and its title.
-        searched: Searches effects beyond another model, with a name for what it keeps and that model's errors.
+        searched: Searches effects beyond another model, whose errors are given.
     """
     judgement, last = judgement_of(evaluation, decided)
     before, of_laws = evaluation.of_null[1], evaluation
@@ -152,7 +152,7 @@ def _on_the_best(before: Found, laws: list[bases.Law], searched: Searched) -> Fo
     effects = tuple((best.model.catalogue.by_name | room.by_name).values())
     catalogue = replace(room, effects=effects, base=best.law, personal=own.personal, without=own.without)
     model = Hypothesis(best.model.terms, catalogue)
-    beyond, more = searched(model, "explain_law", best.errors)
+    beyond, more = searched(model, best.errors)
     other, its_last = judgement_of(beyond, more)
     if other.added and other.after is not None and improves(compare(now.of_all, other.after, evaluation.seed)):
         return beyond, more, replace(other, on=best, beneath=judgement), its_last

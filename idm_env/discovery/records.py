@@ -14,6 +14,7 @@ from idm_env.data.samples import VEHICLES, Samples
 from idm_env.discovery import march
 from idm_env.effects.free import AGO, AGO_S, CARRIED, Now, first_history, next_history, room_behind
 from idm_env.fitting.problem import group_of
+from idm_env.jobs.storage import Store, fingerprint
 
 WINDOW_S = 5.0
 """Horizon of a prediction: long enough for every effect to show, short enough for drivers' noise not to add up."""
@@ -28,7 +29,7 @@ class Records:
     """All records behind one another: ``signals`` [samples, columns], record r in ``bounds[r] : bounds[r + 1]``.
 
     A record begins with what is known of the driver before the episode does, for memories; the episode itself begins at
-    ``first[r]``.
+    ``first[r]``. ``kept`` has what was solved on them, for a run that goes on.
     ``group`` and ``run`` [records] index ``groups`` (who shares IDM parameters) and ``runs``; ``gap`` and ``speed`` are
     the driver's measured ones [samples]; ``period`` is the length of a lap (m) or 0.
     """
@@ -44,6 +45,12 @@ class Records:
     run: np.ndarray
     runs: tuple[str, ...]
     period: float
+    kept: Store | None = None
+
+    @cached_property
+    def mark(self) -> str:
+        """Digest of the signals and of what tells records apart."""
+        return fingerprint(self.signals, self.bounds, self.first, self.length, self.group, self.groups, self.dt)
 
     @cached_property
     def gap(self) -> np.ndarray:

@@ -7,20 +7,18 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
-import torch
 
 from idm_env.discovery import calibrate, judge, model as terms, noise as noises, places
 from idm_env.discovery.calibrate import Calibrated, population
 from idm_env.discovery.closed_loop import ClosedLoopFit
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.score import held_out, log_gain
-from idm_env.discovery.solve import Linear, Problem, Solution, finish, linearise, projected, solve
+from idm_env.discovery.solve import Linear, Problem, Solution, finish, projected, solve
 from idm_env.discovery.units import Units, units
 from idm_env.effects import Effect
 from idm_env.effects.base import Sought
 from idm_env.effects.free import PER
 from idm_env.jobs.progress import OnProgress
-from idm_env.jobs.storage import Store
 
 FAINT = 0.002
 """Share of the squared error, at best on the very data, below which a candidate is fitted in one step only."""
@@ -47,7 +45,6 @@ class Search:
     problem: Problem
     names: Sequence[str]
     located: bool
-    saved: Store
     on_progress: OnProgress
     base: Hypothesis = field(default_factory=Hypothesis)
     last_weighed: tuple[ClosedLoopFit, Solution] | None = None
@@ -116,7 +113,7 @@ class Search:
             self.on_progress(f"round {number}", 0, 1, f"{shape.label} by another state")
             before = held_out(self.problem, solution)
             responses = places.respond(self.problem, solution)
-            return self._curves(solution, responses, before, number, _surfaces(shape)), before
+            return self._curves(solution, responses, before, _surfaces(shape)), before
         have = {t.label for t in solution.model.terms}
         before = held_out(self.problem, solution)
         untried = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
@@ -127,10 +124,9 @@ class Search:
         # What promises most comes first: all others need not be fitted to the end where they stay far behind it.
         for i, (term, promise) in enumerate(sorted(promises, key=lambda pair: -pair[1][0].max())):
             self.on_progress(f"round {number}", i, len(untried) + 1, term.label)
-            key, worth = f"{number}/{term.label}", _worth(scored)
-            scored.append(self._nested(solution, term, before, key, worth=worth, promise=promise))
+            scored.append(self._nested(solution, term, before, worth=_worth(scored), promise=promise))
         self.on_progress(f"round {number}", len(untried), len(untried) + 1, "places, times and shapes")
-        scored += self._places(solution, responses, before, number, first, max(_worth(scored), WORTH))
+        scored += self._places(solution, responses, before, first, max(_worth(scored), WORTH))
         return scored, before
 
     def again(self, solution: Solution, best: Scored, scored: list[Scored]) -> tuple[Solution, list[Scored]]:
@@ -157,14 +153,13 @@ class Search:
         base = replace(solution, model=solution.model.adding(first))
         # Strong starts: along the direction in which they cancel, weak ones see nothing to improve.
         starts = [np.concatenate([solution.values, a, [0.3]]) for a in first.starts]
-        return self._nested(base, second, before, f"{number}/{first.label} + {second.label}", starts, 12)
+        return self._nested(base, second, before, starts, 12)
 
     def _nested(
         self,
         solution: Solution,
         term: Term,
         before: np.ndarray,
-        key: str,
         starts: Sequence[np.ndarray] | None = None,
         iterations: int = 8,
         worth: float = 0.0,
@@ -175,25 +170,17 @@ class Search:
         ``promise`` is that of these ``starts``, where it has been looked at.
         """
         model = solution.model.adding(term)
-        stored = self.saved.get(key)
-        if stored is not None:
-            theta, values = stored["theta"].numpy(), stored["values"].numpy()
-            linear = linearise(self.problem, model, theta, values)
-            best = finish(self.problem, model, theta, values, linear, stored["cost"])
+        starts = starts or [np.append(solution.values, s) for s in term.starts]
+        share, scaled = promise or self._promise(solution, term, starts)
+        # Chance alone lowers the error by the number of parameters over that of the errors.
+        if share.max() < FAINT + term.size / solution.linear.residual.size:
+            best = solve(self.problem, model, solution.theta, scaled[share.argmax()], iterations=1)
         else:
-            starts = starts or [np.append(solution.values, s) for s in term.starts]
-            share, scaled = promise or self._promise(solution, term, starts)
-            # Chance alone lowers the error by the number of parameters over that of the errors.
-            if share.max() < FAINT + term.size / solution.linear.residual.size:
-                best = solve(self.problem, model, solution.theta, scaled[share.argmax()], iterations=1)
-            else:
-                promising = [starts[i] for i in np.argsort(-share)[:RACED] if share[i] >= NEAR * share.max()]
-                first = [solve(self.problem, model, solution.theta, s, iterations=5) for s in promising]
-                best = min(first, key=lambda s: s.cost)
-                if 0.5 * np.log(solution.cost / best.cost) >= worth:
-                    best = solve(self.problem, model, best.theta, best.values, iterations=iterations)
-            arrays = {"theta": torch.from_numpy(best.theta), "values": torch.from_numpy(best.values)}
-            self.saved.put(key, {**arrays, "cost": float(best.cost)})
+            promising = [starts[i] for i in np.argsort(-share)[:RACED] if share[i] >= NEAR * share.max()]
+            first = [solve(self.problem, model, solution.theta, s, iterations=5) for s in promising]
+            best = min(first, key=lambda s: s.cost)
+            if 0.5 * np.log(solution.cost / best.cost) >= worth:
+                best = solve(self.problem, model, best.theta, best.values, iterations=iterations)
         return Scored(term, best, log_gain(before, held_out(self.problem, best)))
 
     def _promise(
@@ -226,7 +213,7 @@ class Search:
         return [e for e in effects if e.sought == what]
 
     def _curves(
-        self, solution: Solution, responses: places.Responses, before: np.ndarray, number: int, curves: Sequence[Term],
+        self, solution: Solution, responses: places.Responses, before: np.ndarray, curves: Sequence[Term],
         worth: float = WORTH,
     ) -> list[Scored]:  # fmt: skip
         """Score curves by their linear response, and those that promise most, and ``worth``, by a fit."""
@@ -243,13 +230,13 @@ class Search:
             low, high = term.parameters[0].low, term.parameters[0].high
             begin = start if term.made is None else np.array([term.made.strength_of(float(x)) for x in start])
             starts = [np.append(solution.values, np.clip(begin, 0.9 * low, 0.9 * high))]
-            result.append(self._nested(solution, term, before, f"{number}/{term.label}", starts))
+            result.append(self._nested(solution, term, before, starts))
         return result
 
     # -- where and when ----------------------------------------------------------------------------------------------
 
     def _places(
-        self, solution: Solution, responses: places.Responses, before: np.ndarray, number: int, first: bool,
+        self, solution: Solution, responses: places.Responses, before: np.ndarray, first: bool,
         worth: float,
     ) -> list[Scored]:  # fmt: skip
         have = {t.label for t in solution.model.terms}
@@ -261,7 +248,7 @@ class Search:
             shortest = {"position": 2, "time": 3}[coordinate]
             interval = places.scan(responses, what, coordinate, width, open_end=open_end, shortest=shortest)
             if interval is None:
-                if named is not None and number == 1:
+                if named is not None:
                     self.unplaced[named.name] = f"no {coordinate} in these data is covered for long enough to be tried"
                 return
             term = _interval_term(what, coordinate, interval, open_end, named, period)
@@ -271,13 +258,13 @@ class Search:
                 result.append(Scored(term, None, interval.gains))
                 return
             starts = [np.append(solution.values, s) for s in _around(term, interval, open_end)]
-            one = self._nested(solution, term, before, f"{number}/{term.label}", starts)
+            one = self._nested(solution, term, before, starts)
             # Runs that chose another place than all together are judged by what they would have gained there.
             gains = np.where(interval.stable, one.gains, interval.gains)
             result.append(Scored(term, one.solution, gains, interval.stable))
 
         def curve_of(*curves: Term) -> None:
-            result.extend(self._curves(solution, responses, before, number, curves, worth))
+            result.extend(self._curves(solution, responses, before, curves, worth))
 
         position = _knots(responses.coordinates["position"], 80.0, 48, period)
         for effect in self._sought("profile"):
@@ -314,7 +301,7 @@ class Search:
                 result.append(Scored(term, None, gains))
             else:
                 start = np.append(solution.values, np.zeros(8))
-                one = self._nested(solution, term, before, f"{number}/{term.label}", [start])
+                one = self._nested(solution, term, before, [start])
                 result.append(Scored(term, one.solution, np.minimum(one.gains, gains + 0.5 * np.abs(gains))))
         return result
 

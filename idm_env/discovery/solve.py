@@ -6,7 +6,8 @@ the solver is that of fits, ``idm_env.fitting.solver``, with log θ as own param
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import time
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +20,7 @@ from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Rows
 from idm_env.fitting.solver import Box, Normal, Progress, minimise
+from idm_env.jobs.storage import fingerprint
 from idm_env.parameters import Parameter
 
 STEP = 1e-4
@@ -27,6 +29,8 @@ PINNED = 1e8
 """Inverse variance of a knot that stays where it is."""
 LONGEST = 0.5
 """Largest step of log θ in one iteration."""
+LONG_S = 0.2
+"""CPU time (s) from which on a solution is kept for a run that goes on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,14 +336,35 @@ def solve(
     iterations: int = 12,
     tolerance: float = 2e-4,
 ) -> Solution:
-    """Minimise over θ of every group and φ, from log θ [G, P] and values [Q]."""
-    nested = _Nested(problem, model)
+    """Minimise over θ of every group and φ, from log θ [G, P] and values [Q].
+
+    What takes long is kept with the records, if they keep anything, by all that it depends on.
+    """
+    kept, key = problem.rows.records.kept, ""
+    if kept is not None:
+        key = _mark(problem, model, theta, values, iterations, tolerance)
+        if (stored := kept.get(key)) is not None:
+            own, shared = stored["own"].numpy(), stored["shared"].numpy()
+            return finish(problem, model, own, shared, linearise(problem, model, own, shared), stored["cost"])
+    clock, nested = time.process_time(), _Nested(problem, model)
     begin = Progress.begin(torch.tensor(theta[None]), torch.tensor(values[None]), damping=1e-3)
     optimum, now = minimise(nested, begin, iterations, tolerance=tolerance)
     linear = nested.linear(optimum.own, optimum.shared)
     own, shared = optimum.own[0].numpy(), optimum.shared[0].numpy()
     cost = float(now.cost.sum()) + float((prior_of(model) * shared**2).sum())
+    if kept is not None and time.process_time() - clock > LONG_S:
+        kept.put(key, {"own": optimum.own[0], "shared": optimum.shared[0], "cost": cost})
     return finish(problem, model, own, shared, linear, cost)
+
+
+def _mark(problem: Problem, model: Hypothesis, *begin: object) -> str:
+    """Return a digest of a problem, a model and where and how it is solved."""
+    rows, noise, prior = problem.rows, problem.noise, problem.known
+    parts = [rows.records.mark, *(getattr(rows, f.name) for f in fields(rows)[1:])]
+    parts += [getattr(prior, f.name) for f in fields(prior)]
+    parts += [] if noise is None else [getattr(noise, f.name) for f in fields(noise)]
+    fixed = np.zeros(0) if model.fixed_phi is None else model.fixed_phi
+    return fingerprint(*parts, problem.sigma, model.terms, model.catalogue, fixed, *begin)
 
 
 def finish(

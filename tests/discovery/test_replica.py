@@ -16,7 +16,6 @@ from idm_env.discovery.records import gather, windows
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import LEAST_GAIN
 from idm_env.discovery.solve import Problem, Solution
-from idm_env.jobs.storage import Store
 
 
 def fitted(seed: int, ou: float, runs: int = 8, seconds: float = 120.0) -> tuple[Problem, Solution]:
@@ -29,7 +28,7 @@ def fitted_to(made: Trajectories) -> tuple[Problem, Solution]:
     records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     rows = windows(records)
     problem = Problem(rows, first_noise(rows), first_prior())
-    searching = Search(problem, ("drag",), False, Store(None, "", False), lambda *_: None)
+    searching = Search(problem, ("drag",), False, lambda *_: None)
     null = searching.null(Hypothesis(), np.tile(problem.prior.centre, (problem.groups, 1)))
     return judge.windowed(records, searching.problem, null)
 

@@ -23,7 +23,6 @@ from idm_env.discovery.search import Search
 from idm_env.discovery.selection import _same_class
 from idm_env.discovery.solve import Problem, Solution, _Nested, linearise, solve
 from idm_env.effects import IDM, Brakes
-from idm_env.jobs.storage import Store
 from idm_env.model_file import Model, load_model, save_model
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
@@ -33,7 +32,7 @@ def begun(records: Records, *names: str) -> tuple[Search, Solution]:
     """Return a search with its null."""
     rows = windows(records)
     problem = Problem(rows, first_noise(rows), first_prior())
-    searching = Search(problem, names, False, Store(None, "", False), lambda *_: None)
+    searching = Search(problem, names, False, lambda *_: None)
     return searching, searching.null(Hypothesis(), np.tile(problem.prior.centre, (problem.groups, 1)))
 
 
@@ -68,7 +67,7 @@ def test_what_promises_nothing_costs_little_and_what_is_there_is_fitted(monkeypa
             copies.clear()
             share, scaled = searching._promise(null, term)
             assert len(share) == len(scaled) == len(term.starts) and copies == [len(term.starts)]
-            found = searching._nested(null, term, np.ones(len(searching.units)), term.label).solution
+            found = searching._nested(null, term, np.ones(len(searching.units))).solution
             assert found is not None
             lowered = 1.0 - (found.linear.residual**2).sum() / (null.linear.residual**2).sum()
             if term.label == hidden:
@@ -117,7 +116,7 @@ def test_candidates_far_behind_the_best_are_not_fitted_to_the_end(monkeypatch: p
         return solve(problem, model, *rest, iterations=iterations)
 
     monkeypatch.setattr(search, "solve", noted)
-    alone = {n: searching._nested(null, terms.simple(n), before, f"alone/{n}") for n in names}
+    alone = {n: searching._nested(null, terms.simple(n), before) for n in names}
     best = max(alone, key=lambda n: alone[n].gains.mean())
     assert best == "speed_time_gap" and len(to_the_end) > 1
     to_the_end.clear()
@@ -177,8 +176,8 @@ def test_a_model_has_one_curve_over_the_past(platoon: Records) -> None:
     solution = solve(searching.problem, Hypothesis((since,)), null.theta, np.zeros(4), iterations=1)
     responses = places.respond(searching.problem, null)
     before = held_out(searching.problem, null)
-    assert [s.term for s in searching._curves(solution, responses, before, 2, (mean,))] == []
-    assert [s.term for s in searching._curves(null, responses, before, 1, (mean,), np.inf)] == [mean]
+    assert [s.term for s in searching._curves(solution, responses, before, (mean,))] == []
+    assert [s.term for s in searching._curves(null, responses, before, (mean,), np.inf)] == [mean]
     with pytest.raises(ValueError, match="one more over the past, and 0 and 2 were given"):
         Hypothesis((since, mean))
 

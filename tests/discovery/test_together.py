@@ -16,7 +16,6 @@ from idm_env.discovery.records import gather, windows
 from idm_env.discovery.score import interval_of
 from idm_env.discovery.search import Search
 from idm_env.discovery.solve import Problem, solve
-from idm_env.jobs.storage import Store
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +24,7 @@ def searching() -> Search:
     records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     rows = windows(records)
     problem = Problem(rows, first_noise(rows), first_prior(), np.ones(len(rows)))
-    return Search(problem, ("speed_time_gap", "drag"), False, Store(None, "", False), lambda *_: None)
+    return Search(problem, ("speed_time_gap", "drag"), False, lambda *_: None)
 
 
 @pytest.fixture(scope="module")
