@@ -102,9 +102,8 @@ def compared(
     for name in better.law.spared if better.against else ():
         add(Hypothesis(null.terms, replace(better.model.catalogue, without=(name,))))
     # A better law comes first: what it lacks is sought, before anything is put down to its drivers.
-    has_better = bool(better.against)
     add(personal(null, own))
-    if laws[-1].is_better and not has_better:
+    if laws[-1].is_better and not better.against:
         for law in others:
             if law.declared == own.declared:
                 add(personal(null, law))

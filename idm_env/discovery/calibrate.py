@@ -5,7 +5,6 @@ of that population, both from closed-loop simulation of the runs that fit, by on
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,21 +21,9 @@ WIDTH = 0.6
 """Width of the first, weak prior of log θ; later the drivers' own spread is taken, between 0.3 and this."""
 
 
-@dataclass(frozen=True, eq=False)
-class Calibrated:
-    """A model with values [Q] of its terms, calibrated on some runs: log θ [G, P] of their drivers, and the prior.
-
-    ``prior`` is the population with its weight; ``fit`` has what every weight that was tried leaves.
-    """
-
-    model: Hypothesis
-    values: np.ndarray
-    theta: np.ndarray
-    prior: Population
-    fit: ClosedLoopFit
-
-
-def calibrate(records: Records, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None) -> Calibrated:
+def calibrate(
+    records: Records, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None
+) -> ClosedLoopFit:
     """Calibrate a model in closed-loop simulation of ``records``, φ as it stands.
 
     1. Drivers one by one, with a prior that hardly weighs anything, from the law's usual values and ``start`` [G, P].
@@ -45,22 +32,12 @@ def calibrate(records: Records, model: Hypothesis, values: np.ndarray, start: np
     """
     own = model.catalogue.own
     problem, theta = judge.unweighed(records, model, values, first_prior(own), start=start)
-    fit = evaluate(records, model, values, population(theta, problem.rows, own), theta)
-    return Calibrated(model, values, fit.theta, fit.problem.prior, fit)
+    return evaluate(records, model, values, population(theta, problem.rows, own), theta)
 
 
-def judged(
-    found: Calibrated, fit: Records, kept: Records | None, everybody: Records, adapt: bool
-) -> tuple[Solution, judge.Judged | None]:
-    """Return every driver's parameters by a calibrated model, and its errors on the test set, if any are given.
-
-    With ``adapt`` drivers have parameters of their own, for which their own runs are needed.
-    """
-    model, values, prior = found.model, found.values, found.prior
-    own = judge.calibrate(everybody if adapt else fit, model, values, prior, start=found.theta)
-    if kept is None:
-        return own, None
-    return own, judge.judge(kept, model, values, own.theta)
+def drivers_of(fit: ClosedLoopFit, records: Records) -> Solution:
+    """Return the parameters of the drivers of ``records`` by a calibrated model."""
+    return judge.calibrate(records, fit.model, fit.values, fit.problem.prior, start=fit.theta)
 
 
 def population(theta: np.ndarray, rows: Rows, own: Sequence[Parameter] = BASE.declared) -> Population:

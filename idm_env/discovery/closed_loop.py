@@ -117,19 +117,11 @@ def further(square: dict[float, float]) -> Sequence[float]:
     return ()
 
 
-@dataclass(frozen=True, eq=False)
-class Line:
-    """A candidate's first look: gains of units [units], and the value of its parameters that all runs speak for."""
-
-    term: Term
-    gains: np.ndarray
-    start: np.ndarray
-
-
-def linear_screen(at: ClosedLoopFit, term: Term) -> Line:
+def linear_screen(at: ClosedLoopFit, term: Term) -> tuple[np.ndarray, np.ndarray]:
     """Score a candidate by its responses at its starts, each scaled by one number from other runs.
 
-    Finite responses rather than derivatives at the null: what acts beyond a threshold shows, too.
+    Return gains of units [units], and the values [q] of its parameters that all runs speak for. Finite responses rather
+    than derivatives at the null: what acts beyond a threshold shows, too.
     """
     model, meters = at.model.adding(term), replace(at.problem, sigma=1.0)
     starts = np.array(term.starts)
@@ -155,12 +147,7 @@ def linear_screen(at: ClosedLoopFit, term: Term) -> Line:
     which = int((pull**2 / (total + 1e-9)).argmax())
     first = np.where(strengths, null + float(amount(total, pull)[which]) * (starts[which] - null), starts[which])
     low, high = (np.array([getattr(p, side) for p in term.parameters]) for side in ("low", "high"))
-    return Line(term, log_gain(own, np.maximum(left, 0.05 * own)), np.clip(first, low, high))
-
-
-def nested(at: ClosedLoopFit, term: Term, start: np.ndarray) -> Solution:
-    """Fit the model with one term more, from its values ``start`` [q], in free simulation over all time; θ follows."""
-    return joint(at, at.model.adding(term), np.append(at.values, start))
+    return log_gain(own, np.maximum(left, 0.05 * own)), np.clip(first, low, high)
 
 
 def joint(at: ClosedLoopFit, model: Hypothesis, values: np.ndarray) -> Solution:

@@ -109,9 +109,11 @@ def finished(
             noisy, agree = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
             errors = replica.ahead(everywhere[0], everywhere[1].theta, noisy.model)
             uneven = float(np.sqrt(np.mean(errors**2)) / (1.48 * np.median(np.abs(errors)) + 1e-9))
-            ladder = replace(ladder, worst=tails.worst(everywhere[0].rows, errors), uneven=uneven, past=agree["past"])
-            ladder = replace(ladder, unsteady=(float(np.median(noisy.sigma)), noisy.memory_s), agreement=agree["scene"])
-            ladder = replace(ladder, sizes=agree["sizes"], tails=agree["tails"], leading=agree.get("leading"))
+            ladder = replace(
+                ladder, worst=tails.worst(everywhere[0].rows, errors), uneven=uneven, past=agree["past"],
+                unsteady=(float(np.median(noisy.sigma)), noisy.memory_s), agreement=agree["scene"],
+                sizes=agree["sizes"], tails=agree["tails"], leading=agree.get("leading"),
+            )  # fmt: skip
         judgement = replace(judgement, ladder=ladder)
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
     limits = ceilings.ceilings_of(decided.null_in_closed_loop, scored, null, decided.rounds[0].smooth_gain)

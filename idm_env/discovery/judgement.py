@@ -66,8 +66,6 @@ class Judgement:
     @property
     def improves(self) -> bool:
         """Whether the compared model may be called better than the null."""
-        if self.before is None or self.after is None:
-            return False
         return improves(self.errors)
 
     def is_exact(self, least_m: float) -> bool:
@@ -199,8 +197,10 @@ class Evaluation:
     def calibrated(self, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None) -> Calibration:
         """Return a model with values [Q], calibrated from log θ [G, P]; errors only where drivers do not adapt."""
         fit = self.searching.calibrated(model, values, start)
-        test = None if self.adapt else self.test
-        return calibrate.judged(fit, self.searching.problem.rows.records, test, self.records, self.adapt)
+        # Drivers who adapt have parameters of their own, for which their own runs are needed.
+        own = calibrate.drivers_of(fit, self.records if self.adapt else self.searching.problem.rows.records)
+        judged = None if self.adapt or self.test is None else judge.judge(self.test, model, values, own.theta)
+        return own, judged
 
     def judged(self, s: Solution, problem: Problem | None = None, pooled: bool = False) -> Calibration:
         """Return the calibration of a model; ``problem`` is what φ was fitted to, if not predictions in windows.
@@ -230,8 +230,7 @@ class Evaluation:
     def calibrated_among(self, model: Hypothesis, wanted: np.ndarray) -> Solution:
         """Return the parameters by a law of the drivers of records ``wanted`` [records], its population."""
         records = self.records.some(wanted)
-        population = calibrate.calibrate(records, model, self.null.values)
-        return calibrate.judged(population, records, None, records, adapt=True)[0]
+        return calibrate.drivers_of(calibrate.calibrate(records, model, self.null.values), records)
 
 
 def judgement_of(evaluation: Evaluation, decided: Decided) -> tuple[Judgement, Solution]:

@@ -19,7 +19,6 @@ from idm_env.discovery.solve import Problem, Solution, equations
 from idm_env.discovery.units import Units, units
 from idm_env.effects.free import FREE
 
-WHATS = PULSED
 PULSE = 0.05
 
 
@@ -45,7 +44,7 @@ class Responses:
         It is projected off what re-calibrated drivers would absorb.
         """
         rows = self.rows
-        response = np.einsum("jrm,rjb->rmb", self.change[WHATS.index(what)], basis)
+        response = np.einsum("jrm,rjb->rmb", self.change[PULSED.index(what)], basis)
         cross = np.zeros((len(rows.records.groups), self.by_theta.shape[-1], basis.shape[-1]))
         np.add.at(cross, rows.group, np.einsum("rmi,rmb->rib", self.by_theta, response))
         follow = np.einsum("gij,gjb->gib", self.absorbed, cross)
@@ -67,13 +66,13 @@ class Responses:
 def respond(problem: Problem, solution: Solution) -> Responses:
     """Return the responses at a solution."""
     rows, records = problem.rows, problem.rows.records
-    every = [(w + 1, *part, PULSE) for w in range(len(WHATS)) for part in pairwise(rows.seconds)]
+    every = [(w + 1, *part, PULSE) for w in range(len(PULSED)) for part in pairwise(rows.seconds)]
     pulses = np.array([(0, 0, 0, 0), *every], dtype=float)
     copies = len(pulses)
     theta = np.repeat(solution.theta[None], copies, axis=0)
     values = np.repeat(solution.values[None], copies, axis=0)
     residual = problem.residual(problem.errors(theta, solution.model, values, pulses))
-    change = (residual[1:] - residual[0]).reshape(len(WHATS), -1, *residual.shape[1:]) / PULSE
+    change = (residual[1:] - residual[0]).reshape(len(PULSED), -1, *residual.shape[1:]) / PULSE
     middle, speed, place = rows.middle, records.speed[rows.middle], records.column("place")[rows.middle]
     coordinates = {
         "position": np.mod(place, records.period) if records.period else place,
@@ -110,7 +109,7 @@ def relative_gap(solution: Solution, rows: Rows, at: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The best interval [begin, end) and amount on all runs, its linear gain, and honest gains of every unit.
+    """The best interval [begin, end) and amount on all runs, and honest gains of every unit.
 
     Edges are those of bins of ``width``.
 
@@ -121,7 +120,6 @@ class Found:
     begin: float
     end: float
     amount: float
-    gain: float
     gains: np.ndarray
     stable: np.ndarray
     width: float
@@ -165,15 +163,15 @@ def scan(
     total = _best(matrix.sum(0), vector.sum(0), allowed)
     gains, stable = np.zeros(len(vector)), np.zeros(len(vector), bool)
     for mine in _by_run(responses):
-        i, j, amount, _ = _best(matrix.sum(0) - matrix[mine].sum(0), vector.sum(0) - vector[mine].sum(0), allowed)
+        i, j, amount = _best(matrix.sum(0) - matrix[mine].sum(0), vector.sum(0) - vector[mine].sum(0), allowed)
         pick = np.zeros(count)
         pick[i : j + 1] = 1.0
         for unit in mine:
             gained = 2 * amount * pick @ vector[unit] - amount**2 * pick @ matrix[unit] @ pick
             gains[unit] = log_gain(gained, responses.square[unit])
         stable[mine] = abs(i - total[0]) <= 1 and abs(j - total[1]) <= 1
-    i, j, amount, gain = total
-    return Found(float(edges[i]), float(edges[j + 1]), amount, gain, gains, stable, width)
+    i, j, amount = total
+    return Found(float(edges[i]), float(edges[j + 1]), amount, gains, stable, width)
 
 
 def _by_run(responses: Responses) -> list[np.ndarray]:
@@ -200,7 +198,7 @@ def _allowed(count: int, open_end: bool, shortest: int, inner: bool) -> np.ndarr
     return allowed
 
 
-def _best(matrix: np.ndarray, vector: np.ndarray, allowed: np.ndarray) -> tuple[int, int, float, float]:
+def _best(matrix: np.ndarray, vector: np.ndarray, allowed: np.ndarray) -> tuple[int, int, float]:
     count = len(vector)
     sums = np.zeros((count + 1, count + 1))
     sums[1:, 1:] = matrix.cumsum(0).cumsum(1)
@@ -214,7 +212,7 @@ def _best(matrix: np.ndarray, vector: np.ndarray, allowed: np.ndarray) -> tuple[
     weight = np.maximum(weight, 1e-12)  # of a single run, left out, nothing remains
     gain = np.where(allowed, push**2 / weight, -np.inf)
     best = np.unravel_index(gain.argmax(), gain.shape)
-    return int(best[0]), int(best[1]), float(push[best] / weight[best]), float(gain[best])
+    return int(best[0]), int(best[1]), float(push[best] / weight[best])
 
 
 def linear_curve(
@@ -257,7 +255,7 @@ def hats(values: np.ndarray, first: float, distance: float, count: int, period: 
 
 def best_period(responses: Responses, shortest: float = 6.0, longest: float = 150.0) -> tuple[str, float, np.ndarray]:
     """Return quantity and period (s) of the sine over the clock that explains most, and honest gains [units]."""
-    tries = list(product(WHATS, np.geomspace(shortest, longest, 60)))
+    tries = list(product(PULSED, np.geomspace(shortest, longest, 60)))
     designs = []
     for what, period in tries:
         phase = 2 * np.pi * responses.coordinates["time"] / period

@@ -2,7 +2,8 @@
 
 Noise of drivers is an Ornstein–Uhlenbeck acceleration, ``da = −a dt/τ + σ √(2/τ) dW``, matched to errors of the gap
 5 s ahead. Every follower drives behind his measured leader. What a smooth function of the scene
-tells of errors in them is what noise alone does: the scene has felt it.
+tells of errors in them is what noise alone does: the scene has felt it. What claims that something is missing must hold
+against drivers' own residuals, too: these are heavy, and have more than one memory.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +22,8 @@ from idm_env.discovery.solve import Population, Problem, Solution, solve
 
 FIRST_SIGMA = 0.1
 """Noise (m/s²) of the median driver from which its size is sought."""
+WIDEST = 2.0
+"""Times that drivers are spread at most in one step."""
 MEMORIES_S = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Memories of drivers' noise that are tried."""
 ALIKE = 5
@@ -29,6 +32,8 @@ DRAWS, ENOUGH = 39, 3
 """Replicas for a likeness, and how many that look as structured as the data are enough (Besag and Clifford 1991)."""
 CLEAR, MOST = 99, 199
 """Replicas after which none such is refusal enough, and replicas at most, of what claims that something is missing."""
+BLOCK_S = 30.0
+"""Length of a block of a driver's own residuals: 10 s cut a memory of 5 s."""
 FEATURES = 40
 EMPTY = np.zeros((1, 0))
 Statistic = Callable[[Rows, np.ndarray], float]
@@ -39,7 +44,8 @@ Statistic = Callable[[Rows, np.ndarray], float]
 class NoisyDrivers:
     """A calibrated model: φ stands in ``model``, log θ [G, P]; noise of σ [G] (m/s²) with a memory of τ (s).
 
-    Noise ``by_speed`` grows in proportion to it, and has σ in the root mean square of a record.
+    Noise ``by_speed`` grows in proportion to it, and has σ in the root mean square of a record. Where the drivers'
+    ``own`` residuals [G] of samples (m/s²) are given, it is σ times blocks of these.
     """
 
     model: Hypothesis
@@ -47,18 +53,29 @@ class NoisyDrivers:
     sigma: np.ndarray
     memory_s: float
     by_speed: bool = False
+    own: tuple[np.ndarray, ...] = ()
+
+    def _noise(self, records: Records, record: int, random: np.random.Generator) -> np.ndarray:
+        """Return accelerations (m/s²) that push a record's driver [samples]."""
+        first, end = records.bounds[record : record + 2]
+        count, group = end - first, records.group[record]
+        if self.own:
+            own, block = self.own[group], round(BLOCK_S / records.dt)
+            begins = random.integers(0, len(own), count // block + 1)
+            which = (begins[:, None] + np.arange(block)).ravel()[:count] % len(own)
+            return np.asarray(self.sigma[group] * own[which])
+        fresh, keep = random.standard_normal(count), np.exp(-records.dt / self.memory_s)
+        fresh[1:] *= np.sqrt(1.0 - keep**2)
+        noise = self.sigma[group] * lfilter([1.0], [1.0, -keep], fresh)
+        speed = np.maximum(records.speed[first:end], 0.0)
+        return np.asarray(noise * (speed / (np.sqrt(np.mean(speed**2)) + 0.1) if self.by_speed else 1.0))
 
     def drive(self, records: Records, random: np.random.Generator, noise_m: float = 0.0) -> Records:
         """Return the records that these drivers would have made behind the same leaders, positions with white noise."""
         driven = replace(records, signals=records.signals.copy())
         pushed, accel = driven.column("pushed"), driven.column("accel")
-        keep = np.exp(-records.dt / self.memory_s)
         for r, (first, end) in enumerate(zip(records.bounds[:-1], records.bounds[1:], strict=True)):
-            fresh = random.standard_normal(end - first)
-            fresh[1:] *= np.sqrt(1.0 - keep**2)
-            noise = self.sigma[records.group[r]] * lfilter([1.0], [1.0, -keep], fresh)
-            speed = np.maximum(records.speed[first:end], 0.0)
-            pushed[first:end] = noise * (speed / (np.sqrt(np.mean(speed**2)) + 0.1) if self.by_speed else 1.0)
+            pushed[first:end] = self._noise(records, r, random)
         rows = whole(driven, longest_s=np.inf, every_s=0.0)
         pulse = np.array([[1.0, 0.0, rows.steps, 1.0]])
         problem = Problem(rows, None, _no_prior(self.theta))
@@ -104,18 +121,37 @@ def drivers_of(
 def _as_large(problem: Problem, solution: Solution, drivers: NoisyDrivers, noise_m: float) -> NoisyDrivers:
     """Return drivers whose errors 5 s ahead are as large as the data's.
 
-    Noise makes drivers look as if they pulled less at their gaps: what changed a gap goes on. So θ is moved by as much
-    as drivers fitted to a replica are off, in the mean of all.
+    Noise makes drivers look as if they pulled less at their gaps: what changed a gap goes on. And their population
+    pulls them together. So θ is moved and spread until drivers fitted to a replica are where those of the data are.
     """
     model, best = drivers.model, drivers
     seen, goal = np.unique(problem.rows.group), np.median(ahead(problem, solution.theta, model) ** 2)
     low, high = model.catalogue.bounds.T
     for _ in range(2):
         replica, theta = _fitted(problem, best, np.random.default_rng(0), noise_m)
-        off = np.median((theta - best.theta)[seen], axis=0)
+        (mine, wide), (its, its_wide), (middle, _) = (_spread(x[seen]) for x in (solution.theta, theta, best.theta))
+        moved = middle + mine - its + (best.theta - middle) * np.clip(wide / its_wide, 1.0 / WIDEST, WIDEST)
         scale = np.sqrt(goal / np.median(ahead(replica, theta, model) ** 2))
-        best = replace(best, theta=np.clip(solution.theta - off, low, high), sigma=best.sigma * scale)
+        best = replace(best, theta=np.clip(moved, low, high), sigma=best.sigma * scale)
     return best
+
+
+def _spread(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the median of log θ [G, P] and the median deviation from it [P]."""
+    middle = np.median(theta, axis=0)
+    return middle, np.median(np.abs(theta - middle), axis=0) + 1e-6
+
+
+def _own_noise(problem: Problem, solution: Solution, drivers: NoisyDrivers, noise_m: float) -> NoisyDrivers:
+    """Return drivers whose noise is what they do beside the model, in means of a second."""
+    records, theta = problem.rows.records, solution.theta
+    rows = windows(records, 1.0)
+    speed = Problem(rows, None, _no_prior(theta)).predict(theta[None], drivers.model, EMPTY)[1][0, :, -1]
+    residual = (records.speed[rows.samples[:, -1]] - speed) / (rows.steps * records.dt)
+    # Of a group without a window nothing is known.
+    each = (residual[rows.group == g] for g in range(len(theta)))
+    own = tuple(np.repeat(x if len(x) else np.zeros(1), rows.steps) for x in each)
+    return _as_large(problem, solution, replace(drivers, theta=theta, sigma=np.ones(len(theta)), own=own), noise_m)
 
 
 def _fitted(
@@ -161,10 +197,11 @@ def agreement(
     driver's other errors take. ``tails``: what lies in the worst windows. ``leading``: what a ``term`` takes in
     whitened windows. Every replica has drivers' noise and that of sensors (``noise_m``). Drivers are fitted to it in
     windows of 5 s, as those of ``solution`` are to the data. Scene, tails and leading claim that something is missing,
-    and have more replicas until that is clear.
+    and have more replicas until that is clear; scene and leading against drivers' own residuals, too. In tails an
+    effect lies together in residuals as well.
     """
     of_errors, random = statistics(seed), np.random.default_rng(seed)
-    drivers = drivers_of(problem, solution, noise_m, of_errors)
+    gaussian = drivers_of(problem, solution, noise_m, of_errors)
 
     def gain(windowed: Problem, theta: np.ndarray) -> float:
         assert term is not None
@@ -175,30 +212,37 @@ def agreement(
         return 1.0 - float(np.exp(-2.0 * mean))
 
     def told(windowed: Problem, theta: np.ndarray, names: Sequence[str]) -> dict[str, float]:
-        error = ahead(windowed, theta, drivers.model)
+        error = ahead(windowed, theta, gaussian.model)
         return {n: of_errors[n](windowed.rows, error) if n in of_errors else gain(windowed, theta) for n in names}
 
     leading = [] if term is None else ["leading"]
-    claims, mine = ["scene", "tails", *leading], told(problem, solution.theta, [*of_errors, *leading])
-    shares: dict[str, list[float]] = {name: [] for name in mine}
+    mine = told(problem, solution.theta, [*of_errors, *leading])
 
-    def exceedances(name: str) -> int:
-        return sum(share >= mine[name] for share in shares[name])
+    def likenesses(drivers: NoisyDrivers, names: Sequence[str], claims: Sequence[str]) -> dict[str, ladder.Agreement]:
+        shares: dict[str, list[float]] = {name: [] for name in names}
 
-    def likeness(name: str) -> ladder.Agreement:
-        count, replicas = exceedances(name), len(shares[name])
-        p_value = count / replicas if count == ENOUGH else (count + 1) / (replicas + 1)
-        return ladder.Agreement(mine[name], p_value, replicas, float(np.mean(shares[name])))
+        def exceedances(name: str) -> int:
+            return sum(share >= mine[name] for share in shares[name])
 
-    for draw in range(1, MOST + 1):
-        still = [n for n in mine if exceedances(n) < ENOUGH and (draw <= DRAWS or n in claims)]
-        # Of what is clearly refused no more is asked, and nothing else then: something is missing.
-        if not still or (draw > CLEAR and not all(exceedances(n) for n in claims)):
-            break
-        replica, theta = _fitted(problem, drivers, random, noise_m)
-        for name, share in told(replica, theta, still).items():
-            shares[name].append(share)
-    return drivers, {name: likeness(name) for name in mine}
+        def likeness(name: str) -> ladder.Agreement:
+            count, replicas = exceedances(name), len(shares[name])
+            p_value = count / replicas if count == ENOUGH else (count + 1) / (replicas + 1)
+            return ladder.Agreement(mine[name], p_value, replicas, float(np.mean(shares[name])))
+
+        for draw in range(1, MOST + 1):
+            still = [n for n in names if exceedances(n) < ENOUGH and (draw <= DRAWS or n in claims)]
+            # Of what is clearly refused no more is asked, and nothing else then: something is missing.
+            if not still or (draw > CLEAR and not all(exceedances(n) for n in claims)):
+                break
+            replica, theta = _fitted(problem, drivers, random, noise_m)
+            for name, share in told(replica, theta, still).items():
+                shares[name].append(share)
+        return {name: likeness(name) for name in names}
+
+    agree = likenesses(gaussian, list(mine), ["scene", "tails", *leading])
+    if claims := [name for name in ("scene", *leading) if agree[name].is_refused]:
+        agree |= likenesses(_own_noise(problem, solution, gaussian, noise_m), claims, claims)
+    return gaussian, agree
 
 
 def _no_prior(theta: np.ndarray) -> Population:

@@ -202,7 +202,6 @@ class DataCard:
     share_approaching: float
     share_following: float
     at_bounds: dict[str, int]
-    unexplained_gain: list[float]
     horizon_s: float
     lap_m: float | None
 

@@ -9,8 +9,9 @@ from itertools import product
 import numpy as np
 
 from idm_env.discovery import calibrate, judge, model as terms, noise as noises, places
-from idm_env.discovery.calibrate import Calibrated, population
+from idm_env.discovery.calibrate import population
 from idm_env.discovery.closed_loop import ClosedLoopFit
+from idm_env.discovery.march import PULSED
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.score import held_out, log_gain
 from idm_env.discovery.solve import Linear, Problem, Solution, finish, projected, solve
@@ -47,9 +48,7 @@ class Search:
     located: bool
     on_progress: OnProgress
     base: Hypothesis = field(default_factory=Hypothesis)
-    last_weighed: tuple[ClosedLoopFit, Solution] | None = None
-    """The model that was weighed last, and its errors in free simulation."""
-    calibrations: dict[tuple[int, bytes, bytes | None], Calibrated] = field(default_factory=dict)
+    calibrations: dict[tuple[int, bytes, bytes | None], ClosedLoopFit] = field(default_factory=dict)
     """What ``calibrated`` has said, by model (held here, so that its id stays its), φ and log θ to begin with."""
     squares: dict[Solution, np.ndarray] = field(default_factory=dict)
     """What ``closed_loop_squares`` has said."""
@@ -75,15 +74,13 @@ class Search:
 
         In windows its drivers stay as they are. The weight of the prior becomes that of the problem.
         """
-        if self.last_weighed is None or self.last_weighed[1] is not now:
-            fit = self.calibrated(now.model, now.values, now.theta)
-            self.problem = replace(
-                self.problem, prior=replace(self.problem.prior, error_correlation_s=fit.prior.error_correlation_s)
-            )
-            self.last_weighed = fit.fit, replace(now, prior=fit.prior)
-        return self.last_weighed
+        fit = self.calibrated(now.model, now.values, now.theta)
+        prior = fit.problem.prior
+        mine = replace(self.problem.prior, error_correlation_s=prior.error_correlation_s)
+        self.problem = replace(self.problem, prior=mine)
+        return fit, replace(now, prior=prior)
 
-    def calibrated(self, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None) -> Calibrated:
+    def calibrated(self, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None) -> ClosedLoopFit:
         """Return a model with values [Q] calibrated on the validation runs, done once for one ``start`` [G, P]."""
         key = (id(model), values.tobytes(), None if start is None else start.tobytes())
         if key not in self.calibrations:
@@ -103,8 +100,8 @@ class Search:
         prior = replace(prior, error_correlation_s=self.problem.prior.error_correlation_s)
         return replace(self.problem, noise=noise, prior=prior)
 
-    def round(self, solution: Solution, number: int, first: bool = True) -> tuple[list[Scored], np.ndarray]:
-        """Score every candidate on top of ``solution``; return them and the null's held-out squares [units].
+    def round(self, solution: Solution, number: int, first: bool = True) -> list[Scored]:
+        """Score every candidate on top of ``solution``.
 
         Shapes are sought in the ``first`` round only: beside an effect, a curve is what that one lacks of the true one.
         Beside a shape only surfaces over its state and another are tried.
@@ -113,7 +110,7 @@ class Search:
             self.on_progress(f"round {number}", 0, 1, f"{shape.label} by another state")
             before = held_out(self.problem, solution)
             responses = places.respond(self.problem, solution)
-            return self._curves(solution, responses, before, _surfaces(shape)), before
+            return self._curves(solution, responses, before, _surfaces(shape))
         have = {t.label for t in solution.model.terms}
         before = held_out(self.problem, solution)
         untried = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
@@ -127,7 +124,7 @@ class Search:
             scored.append(self._nested(solution, term, before, worth=_worth(scored), promise=promise))
         self.on_progress(f"round {number}", len(untried), len(untried) + 1, "places, times and shapes")
         scored += self._places(solution, responses, before, first, max(_worth(scored), WORTH))
-        return scored, before
+        return scored
 
     def again(self, solution: Solution, best: Scored, scored: list[Scored]) -> tuple[Solution, list[Scored]]:
         """Judge the leading candidates once more, all by the noise that the best one leaves."""
@@ -277,7 +274,7 @@ class Search:
             return result
         for what in ("time_gap", "accel_and_decel", "acceleration"):
             interval_of(what, "position")
-        for what in places.WHATS:
+        for what in PULSED:
             interval_of(what, "time")
         for what in ("desired_speed", "accel_and_decel", "acceleration"):
             interval_of(what, "time", open_end=True)
@@ -290,7 +287,7 @@ class Search:
         if first:
             seen = {c: responses.coordinates[c] for c in terms.STATES}
             knots = {c: _knots(x, terms.STATES[c], 16) for c, x in seen.items() if np.ptp(x) > 0.0}
-            shapes = [terms.curve(what, c, *knots[c]) for what, c in product(places.WHATS, knots)]
+            shapes = [terms.curve(what, c, *knots[c]) for what, c in product(PULSED, knots)]
             # Each kind has as many fits as the best names: what is told by a name has been held against both.
             for past in (False, True):
                 curve_of(*(t for t in shapes if t.past is past))

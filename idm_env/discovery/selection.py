@@ -49,18 +49,12 @@ With the right effect in the model, generated sets without drivers' noise come t
 
 
 @dataclass(eq=False)
-class Round:
-    """What one round of the search saw, for the report."""
+class Round(together.Step):
+    """What one round of the search saw, for the report; ``left`` [units] is the gain of any smooth function."""
 
-    scored: list[Scored]
-    tested: Tested
-    before: np.ndarray
-    left: np.ndarray
-    winner: int | None
+    left: np.ndarray = field(default_factory=lambda: np.zeros(0))
     partner: int | None = None
-    equivalent: list[int] = field(default_factory=list)
     share: float = float("nan")
-    refusal: Refusal | None = None
     partial: int | None = None
     in_closed_loop: bool = False
     """Whether gains are those of free simulation, and not of predictions in windows."""
@@ -145,11 +139,8 @@ def _joined(
     if few or (steps and (_is_shape(now) or _at_floor(searching, now))):
         return None
     joined, forward = together.grow(searching, searching.weighed(now)[0], len(null.model.terms), seed)
-    rounds += [
-        Round(s.scored, s.tested, last.before, last.left, s.winner, equivalent=s.equivalent, in_closed_loop=True,
-              run=units(searching.problem.rows.records, MANY_RUNS).run, refusal=s.refusal)
-        for s in forward if s.scored
-    ]  # fmt: skip
+    run = units(searching.problem.rows.records, MANY_RUNS).run
+    rounds += [Round(**vars(step), in_closed_loop=True, run=run) for step in forward if step.scored]
     return joined
 
 
@@ -162,7 +153,7 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
         # Beside a surface nothing more is sought.
         if len(steps) == MOST_ROUNDS or (steps and (now.model.terms[-1].by or _at_floor(searching, now))):
             break
-        scored, before = searching.round(now, number, not steps)
+        scored = searching.round(now, number, not steps)
         scored = [s for s in scored if not _same_class(s.term, now.model)]
         if not scored and last is not None:
             # The only candidate was a latency below a step, which is the null's now and leads nothing.
@@ -181,7 +172,7 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
             now, scored = searching.again(now, scored[fitted[0]], scored)
             tested = _tested(searching, scored, seed)
         left = judge.ceiling(places.respond(searching.problem, now))
-        this = Round(scored, tested, before, left, None, run=searching.units.run)
+        this = Round(scored, tested, left=left, run=searching.units.run)
         rounds.append(this)
         _choose(searching, now, this)
         if this.winner is None:
@@ -239,7 +230,7 @@ def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | 
     scored = [searching.pair(now, pair, before, number) for pair in pairs]
     tested = _tested(searching, (*last.scored, *scored), seed)
     mine = Tested(*(x[len(last.scored) :] for x in (tested.p_value, tested.gain, tested.interval)))
-    this = Round(scored, mine, before, last.left, None, run=searching.units.run)
+    this = Round(scored, mine, left=last.left, run=searching.units.run)
     _choose(searching, now, this)
     if this.winner is None:
         return None
@@ -247,7 +238,7 @@ def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | 
     assert solution is not None
     both = [Scored(term, solution, scored[this.winner].gains) for term in solution.model.terms[-2:]]
     twice = Tested(*(np.repeat(x[[this.winner]], 2, axis=0) for x in (mine.p_value, mine.gain, mine.interval)))
-    return Round(both, twice, this.before, this.left, 0, 1, share=this.share, run=this.run)
+    return Round(both, twice, 0, left=this.left, partner=1, share=this.share, run=this.run)
 
 
 def _same_class(term: Term, model: Hypothesis) -> bool:

@@ -13,8 +13,9 @@ from itertools import combinations, product
 import numpy as np
 from scipy.stats import norm as normal
 
+from idm_env.discovery.march import PULSED
 from idm_env.discovery.model import SPREAD
-from idm_env.discovery.places import WHATS, Responses, hats, linear_curve, scan
+from idm_env.discovery.places import Responses, hats, linear_curve, scan
 from idm_env.discovery.records import Rows
 from idm_env.effects.free import HISTORY
 
@@ -104,7 +105,7 @@ def past_out(responses: Responses) -> np.ndarray:
     Where no curve gains, these stand.
     """
     left, most = responses.residual, 0.0
-    for what, feature in product(WHATS, HISTORY):
+    for what, feature in product(PULSED, HISTORY):
         values = responses.coordinates[feature]
         low, high = np.quantile(values, (0.002, 0.998))
         basis = hats(values, low, max(high - low, 1e-6) / (KNOTS - 1), KNOTS)

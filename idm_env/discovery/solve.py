@@ -340,10 +340,10 @@ def solve(
 
     What takes long is kept with the records, if they keep anything, by all that it depends on.
     """
-    kept, key = problem.rows.records.kept, ""
-    if kept is not None:
+    store, key = problem.rows.records.kept, ""
+    if store is not None:
         key = _mark(problem, model, theta, values, iterations, tolerance)
-        if (stored := kept.get(key)) is not None:
+        if (stored := store.get(key)) is not None:
             own, shared = stored["own"].numpy(), stored["shared"].numpy()
             return finish(problem, model, own, shared, linearise(problem, model, own, shared), stored["cost"])
     clock, nested = time.process_time(), _Nested(problem, model)
@@ -352,8 +352,8 @@ def solve(
     linear = nested.linear(optimum.own, optimum.shared)
     own, shared = optimum.own[0].numpy(), optimum.shared[0].numpy()
     cost = float(now.cost.sum()) + float((prior_of(model) * shared**2).sum())
-    if kept is not None and time.process_time() - clock > LONG_S:
-        kept.put(key, {"own": optimum.own[0], "shared": optimum.shared[0], "cost": cost})
+    if store is not None and time.process_time() - clock > LONG_S:
+        store.put(key, {"own": optimum.own[0], "shared": optimum.shared[0], "cost": cost})
     return finish(problem, model, own, shared, linear, cost)
 
 

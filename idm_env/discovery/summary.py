@@ -63,7 +63,7 @@ def summarise(
     least = judge.least_m(evaluation.records)
     is_large = left[0] > LARGE * left[1] and not judged.is_exact(least)
     verdict, refusal = _verdict(judged, rounds, added, others, strengths, problem, least, is_large)
-    data = _data(trajectories, evaluation, rounds, judged.null, by)
+    data = _data(trajectories, evaluation, judged.null, by)
     sentence = words.headline(
         verdict, [f.clause for f in added], refusal, judged.tried, errors, judged.shared, others, law
     )
@@ -356,9 +356,7 @@ def standard_errors(solution: Solution) -> np.ndarray:
     return np.sqrt(np.einsum("gii->gi", inverse))
 
 
-def _data(
-    trajectories: Trajectories, evaluation: Evaluation, rounds: Sequence[Round], null: Solution, by: str
-) -> result.DataCard:
+def _data(trajectories: Trajectories, evaluation: Evaluation, null: Solution, by: str) -> result.DataCard:
     prepared, rows = evaluation.records, evaluation.searching.problem.rows
     inside = np.concatenate([np.arange(a, b) for a, b in zip(prepared.first, prepared.bounds[1:], strict=True)])
     speed, gap = prepared.speed[inside], prepared.gap[inside]
@@ -380,7 +378,6 @@ def _data(
         share_approaching=float((~free & (closing > 1.0) & ~standing).mean()),
         share_following=float((~free & (closing <= 1.0) & ~standing).mean()),
         at_bounds=null.model.catalogue.at_bounds(null.theta),
-        unexplained_gain=[float(r.left.mean()) for r in rounds],
         horizon_s=rows.steps * prepared.dt,
         lap_m=prepared.period or None,
     )

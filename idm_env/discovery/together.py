@@ -1,12 +1,12 @@
 """Terms that show in free simulation: added one by one by held-out score, all fitted at once, and taken back again."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from idm_env.discovery import closed_loop, judge, model as terms
-from idm_env.discovery.closed_loop import ClosedLoopFit, Line
+from idm_env.discovery.closed_loop import ClosedLoopFit
 from idm_env.discovery.model import Term
 from idm_env.discovery.score import ALPHA, CLOSED_LOOP_SHARE, Tested, at_level, interval_of, westfall_young
 from idm_env.discovery.search import Scored, Search
@@ -24,12 +24,15 @@ SAME = 0.15
 
 @dataclass(eq=False)
 class Step:
-    """One step forward: every candidate, its test, and which was added; ``equivalent`` did about as well."""
+    """One step forward: every candidate, its test, and which was added; ``equivalent`` did about as well.
+
+    ``refusal`` says why nothing was added.
+    """
 
     scored: list[Scored]
     tested: Tested
-    winner: int | None
-    equivalent: list[int]
+    winner: int | None = None
+    equivalent: list[int] = field(default_factory=list)
     refusal: Refusal | None = None
 
 
@@ -42,13 +45,13 @@ class Joined:
     gains: np.ndarray
 
 
-def linear_screens(searching: Search, at: ClosedLoopFit) -> list[Line]:
-    """Return a first look at every candidate without a place that the model has not."""
+def untried(searching: Search, at: ClosedLoopFit) -> list[Term]:
+    """Return every candidate without a place that the model has not."""
     have = {t.effect for t in at.model.terms}
     late = any(ALL[name].latency for name in have if name is not None)
     effects = [searching.base.catalogue.by_name[n] for n in searching.names if n not in have]
     simple = [e for e in effects if e.sought == "anywhere" and not (late and ALL[e.name].latency)]
-    return [closed_loop.linear_screen(at, terms.simple(e)) for e in simple]
+    return [terms.simple(e) for e in simple]
 
 
 def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple[Joined | None, list[Step]]:
@@ -83,26 +86,26 @@ def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple
 
 
 def _forward(searching: Search, fit: ClosedLoopFit, seed: int) -> tuple[Step, Solution | None]:
-    lines = linear_screens(searching, fit)
-    if not lines:
+    candidates = untried(searching, fit)
+    if not candidates:
         nothing = np.zeros(0)
-        return Step([], Tested(nothing, nothing, np.zeros((0, 2))), None, []), None
-    scored = [Scored(line.term, None, line.gains) for line in lines]
+        return Step([], Tested(nothing, nothing, np.zeros((0, 2)))), None
+    gains, starts = zip(*(closed_loop.linear_screen(fit, term) for term in candidates), strict=True)
+    scored = [Scored(term, None, gain) for term, gain in zip(candidates, gains, strict=True)]
 
     def test() -> Tested:
         return at_level(westfall_young(np.array([s.gains for s in scored]), seed, fit.units.run), CLOSED_LOOP_SHARE)
 
-    tested = test()
-    first = tested
+    tested = first = test()
     for i in [i for i in np.argsort(-first.gain) if first.p_value[i] < ALPHA and first.gain[i] >= LEAST_GAIN][:TRIED]:
-        fitted = closed_loop.nested(fit, scored[i].term, lines[i].start)
-        scored[i] = Scored(scored[i].term, fitted, closed_loop.gains(fit, fitted))
+        fitted = closed_loop.joint(fit, fit.model.adding(candidates[i]), np.append(fit.values, starts[i]))
+        scored[i] = Scored(candidates[i], fitted, closed_loop.gains(fit, fitted))
         tested = test()
         if tested.p_value[i] < ALPHA and tested.gain[i] >= LEAST_GAIN:
             alike = (first.p_value < ALPHA) & (first.gain >= (1.0 - SAME) * first.gain[i])
             same = [j for j in np.flatnonzero(alike).tolist() if j != i]
             return Step(scored, tested, int(i), same), fitted
-    return Step(scored, tested, None, []), None
+    return Step(scored, tested), None
 
 
 def _backward(start: ClosedLoopFit, solution: Solution, base: int) -> Solution:

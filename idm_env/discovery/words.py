@@ -148,8 +148,8 @@ def _interval(term: Term, estimates: Sequence[float]) -> str:
     return f"between {estimates[1]:.0f} and {estimates[2]:.0f} {unit}"
 
 
-def reason(refusal: Refusal | None, tried: str = "", law: str = "IDM") -> str:
-    """Say why nothing (more) was added to a ``law``; ``tried`` is the plain name of what came nearest."""
+def reason(refusal: Refusal | None, tried: str = "") -> str:
+    """Say why nothing (more) was added; ``tried`` is the plain name of what came nearest."""
     if refusal is None:
         return ""
     figure = refusal.figure
@@ -169,7 +169,6 @@ def reason(refusal: Refusal | None, tried: str = "", law: str = "IDM") -> str:
             "and no candidate does"
         ),
         Reason.TAILS: "the worst predictions lie together",
-        Reason.LAW: f"another law predicts better than all that was added to {law}",
     }[refusal.reason]
 
 

@@ -14,12 +14,12 @@ from scipy.stats import t as student
 from idm_env.data import episodes, synthetic
 from idm_env.discovery import model as terms, places, search, selection
 from idm_env.discovery.calibrate import first_prior
-from idm_env.discovery.march import COLUMNS
+from idm_env.discovery.march import COLUMNS, PULSED
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.noise import first_noise
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.score import SYSTEMATIC, half_width, held_out
-from idm_env.discovery.search import Search
+from idm_env.discovery.search import Scored, Search
 from idm_env.discovery.selection import _same_class
 from idm_env.discovery.solve import Problem, Solution, _Nested, linearise, solve
 from idm_env.effects import IDM, Brakes
@@ -44,7 +44,7 @@ def made(seed: int, **choices: object) -> Records:
 def test_a_time_is_found_although_its_scan_ends_a_bin_off() -> None:
     """Drivers' own parameters make up for a wrong time, so that between two bins the cost has a local minimum."""
     searching, null = begun(made(90150, effect="regime_shift"), "regime_shift")
-    scored, _ = searching.round(null, 1)
+    scored = searching.round(null, 1)
     solution = scored[0].solution
     assert solution is not None
     strength, time = solution.values
@@ -120,7 +120,7 @@ def test_candidates_far_behind_the_best_are_not_fitted_to_the_end(monkeypatch: p
     best = max(alone, key=lambda n: alone[n].gains.mean())
     assert best == "speed_time_gap" and len(to_the_end) > 1
     to_the_end.clear()
-    scored = {s.term.label: s for s in searching.round(null, 1)[0] if s.term.label in alone}
+    scored = {s.term.label: s for s in searching.round(null, 1) if s.term.label in alone}
     assert to_the_end == [best]
     np.testing.assert_array_equal(scored[best].gains, alone[best].gains)
     behind = [s.gains.mean() for n, s in scored.items() if n != best]
@@ -187,7 +187,7 @@ def test_responses_of_all_seconds_are_that_of_the_whole_window(dt: float) -> Non
     """At every time step: a change that lasts is what its parts of a second add up to."""
     searching, null = begun(made(3, runs=2, followers=1, seconds=30.0, dt=dt), "drag")
     problem, always = searching.problem, terms.curve("time_gap", "time", 0.0, 200.0, 2)
-    rows, change = problem.rows, places.respond(problem, null).change[places.WHATS.index("time_gap")]
+    rows, change = problem.rows, places.respond(problem, null).change[PULSED.index("time_gap")]
     assert rows.seconds[0] == 0 and rows.seconds[-1] == rows.steps and change.shape[0] == rows.middle.shape[1]
 
     def left(model: Hypothesis, values: np.ndarray) -> np.ndarray:
@@ -230,12 +230,12 @@ def test_whatever_rounds_join_is_one_model(tmp_path: Path) -> None:
 def test_a_latency_below_a_step_that_was_all_that_was_asked_for_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """It becomes the null's, and nothing is left to try: that is an answer and no error."""
     searching, null = begun(made(7, runs=6, followers=2, seconds=60.0, ou=0.0, noise=0.0), "delay")
-    scored, before = searching.round(null, 1)
+    scored = searching.round(null, 1)
     solution = scored[0].solution
     assert solution is not None
     model = solution.model
     short = solve(searching.problem, model, solution.theta, np.array([0.05]), iterations=0)
-    rounds = [([replace(scored[0], solution=short, gains=np.full(6, 0.5))], before), ([], before)]
+    rounds: list[list[Scored]] = [[replace(scored[0], solution=short, gains=np.full(6, 0.5))], []]
     monkeypatch.setattr(Search, "round", lambda *_: rounds.pop(0))
     monkeypatch.setattr(Search, "null", lambda *_: short)
     monkeypatch.setattr(Search, "again", lambda _, now, best, scored: (now, scored))

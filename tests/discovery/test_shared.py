@@ -9,7 +9,8 @@ from scipy.stats import norm
 
 from benchmarks import undeclared
 from idm_env.discovery import shared
-from idm_env.discovery.places import WHATS, Responses, respond
+from idm_env.discovery.march import PULSED
+from idm_env.discovery.places import Responses, respond
 from idm_env.discovery.records import Rows
 from idm_env.discovery.shared import after_stops, beyond, past_out, standing_out
 from idm_env.discovery.units import Units
@@ -62,13 +63,13 @@ def test_what_followers_do_of_one_past_is_no_cause_of_a_run(of_past: bool) -> No
     random, runs, count = np.random.default_rng(2), 10, 33
     run = np.repeat(np.arange(runs), 3 * count)
     since = np.where(np.isin(run, (1, 3, 6)), np.tile(np.arange(count) * 5.0, 3 * runs) % 90.0, 90.0)[:, None]
-    change = random.standard_normal((len(WHATS), 1, len(run), 12))
+    change = random.standard_normal((len(PULSED), 1, len(run), 12))
     # Followers of one run have one leader, whose motion makes their responses alike.
-    change = np.repeat(change.reshape(len(WHATS), 1, runs, 3, count, 12)[:, :, :, :1], 3, axis=3).reshape(change.shape)
+    change = np.repeat(change.reshape(len(PULSED), 1, runs, 3, count, 12)[:, :, :, :1], 3, axis=3).reshape(change.shape)
     strength = (
         np.exp(-since / 30.0) if of_past else ((run == 3)[:, None] & (np.tile(np.arange(count), 30) < 8)[:, None])
     )
-    residual = 3.0 * change[WHATS.index("time_gap"), 0] * strength + random.standard_normal((len(run), 12))
+    residual = 3.0 * change[PULSED.index("time_gap"), 0] * strength + random.standard_normal((len(run), 12))
     coordinates = dict.fromkeys(HISTORY, random.random(since.shape)) | {"time_since_stop": since}
     records = SimpleNamespace(groups=[0])
     rows = cast(Rows, SimpleNamespace(run=run, record=run, group=0 * run, records=records))

@@ -116,14 +116,14 @@ def test_a_choice_is_made_anew_without_every_fold() -> None:
     scored = [
         SimpleNamespace(gains=g, term=terms.simple(n), solution=1) for g, n in zip(gains, ("lag", "drag"), strict=True)
     ]
-    this = Round(scored, None, None, None, 0, run=np.arange(6))  # type: ignore[arg-type]
+    this = Round(scored, None, 0, run=np.arange(6))  # type: ignore[arg-type]
     fold = np.array([1, 1, 2, 2, 3, 3])
     assert this.chosen_in(0, fold) == pytest.approx(2 / 3) and this.chosen_in(1, fold) == pytest.approx(1 / 3)
     this.equivalent = [1]
     assert this.chosen_in(0, fold) == 1.0
     # Where followers are counted, each belongs to the fold of its run.
     thrice = [SimpleNamespace(gains=np.repeat(s.gains, 3), term=s.term, solution=1) for s in scored]
-    followers = Round(thrice, None, None, None, 0, run=np.repeat(np.arange(6), 3))  # type: ignore[arg-type]
+    followers = Round(thrice, None, 0, run=np.repeat(np.arange(6), 3))  # type: ignore[arg-type]
     assert followers.chosen_in(0, fold) == pytest.approx(2 / 3)
 
 
