@@ -51,10 +51,7 @@ class Law(NamedTuple):
         title = self.law.title or self.law.kind
         if self.model.catalogue.without:
             return f"{title} without {' and '.join(self.model.catalogue.without).replace('_', ' ')}"
-        if not self.own:
-            return title
-        *others, last = (ALL[name].title for name in self.own)
-        return f"{title} with every driver's own {', '.join(others)}{' and ' if others else ''}{last}"
+        return f"{title} with own strengths" if self.own else title
 
     @property
     def is_better(self) -> bool:

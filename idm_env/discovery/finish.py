@@ -12,6 +12,7 @@ from idm_env.data.fingerprint import fitted_on
 from idm_env.discovery import bases, ceilings, fleet, found, judge, places, replica, shared, summary, tails
 from idm_env.discovery.compare import compare
 from idm_env.discovery.judgement import Evaluation, Judgement, judgement_of
+from idm_env.discovery.ladder import UNEVEN
 from idm_env.discovery.model import Hypothesis, effects_of
 from idm_env.discovery.records import Records
 from idm_env.discovery.result import Result
@@ -113,6 +114,7 @@ def finished(
                 ladder, worst=tails.worst(everywhere[0].rows, errors), uneven=uneven, past=agree["past"],
                 unsteady=(float(np.median(noisy.sigma)), noisy.memory_s), agreement=agree["scene"],
                 sizes=agree["sizes"], tails=agree["tails"], leading=agree.get("leading"),
+                few=tails.held_by(everywhere[0].rows, errors) if uneven >= UNEVEN else (),
             )  # fmt: skip
         judgement = replace(judgement, ladder=ladder)
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]

@@ -102,7 +102,7 @@ class Ladder:
 
     By rung, where it has them, also the gap's error in closed-loop simulation, 10 s ahead, and the CRPS 5 s ahead (m).
     Parts add up to 1, that is to the squared error of drivers with their own parameters. Drift is what a driver's other
-    errors foresee. What is ``not foreseen`` is new in these 5 s, or nothing that a smooth function of the scene tells.
+    errors foresee. What is ``unexplained`` is new in these 5 s, or nothing that a smooth function of the scene tells.
     """
 
     rungs_m: dict[str, float]
@@ -127,6 +127,8 @@ class Ladder:
     uneven: float = 0.0
     unsteady: tuple[float, float] | None = None
     """Noise of the median driver that would explain the errors (m/s²), and its memory (s)."""
+    few: tuple[str, ...] = ()
+    """Groups of drivers who hold half of the squared error, where that is more uneven than drivers' noise is."""
 
     @property
     def unnamed(self) -> float:
@@ -172,21 +174,22 @@ def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, f
     structure = _share(rows, left["drift followed"], left["smooth function of the scene"], error)
     total = _rmse(models[own].ahead) ** 2
     taken = {
-        "sensors": floor_m**2,
+        "measurement noise": floor_m**2,
         last: total - _rmse(error) ** 2,
-        "structure without a name": structure.share * _rmse(error) ** 2,
-        "drift": _rmse(error) ** 2 - _rmse(rest) ** 2,
+        "systematic, unidentified": structure.share * _rmse(error) ** 2,
+        "intra-driver variability": _rmse(error) ** 2 - _rmse(rest) ** 2,
     }
     parts, room = {}, 1.0
     for name, square in taken.items():
         parts[name] = min(max(square / total, 0.0), room)
         room -= parts[name]
-    order = ("sensors", "drift", *([] if last == own else [last]), "structure without a name")
+    law = [] if last == own else [last]
+    order = ("measurement noise", "intra-driver variability", *law, "systematic, unidentified")
     ahead = {name: judged.ahead for name, judged in models.items()} | left
     free_m = {name: judged.summary()["gap_rmse_m"] for name, judged in models.items()}
     ten_s_m = {name: _rmse(judged.further) for name, judged in models.items() if len(judged.further)}
     crps_m = {name: _crps(rows, what) for name, what in ahead.items()}
-    parts = {name: parts[name] for name in order} | {"not foreseen": room}
+    parts = {name: parts[name] for name in order} | {"unexplained": room}
     return Ladder(rungs, free_m, ten_s_m, crps_m, parts, structure, dependences(rows, error, seed))
 
 

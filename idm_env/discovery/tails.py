@@ -38,6 +38,14 @@ def concentration(rows: Rows, error: np.ndarray) -> float:
     return float(relative[: max(1, round(WORST * len(relative)))].sum() / relative.sum())
 
 
+def held_by(rows: Rows, error: np.ndarray) -> tuple[str, ...]:
+    """Return the fewest groups of drivers who hold half of the squared errors [W]."""
+    total = np.bincount(rows.group, error**2)
+    order = np.argsort(-total)
+    count = int(np.searchsorted(np.cumsum(total[order]), 0.5 * total.sum())) + 1
+    return tuple(rows.records.groups[group] for group in order[:count])
+
+
 def worst(rows: Rows, error: np.ndarray) -> Worst | None:
     """Return the condition that is commoner in the windows with the largest errors [W] than in all, or None."""
     relative, records, dt = _relative(rows, error), rows.records, rows.records.dt

@@ -159,7 +159,7 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
         "usual strengths",
         Reason.NO_GAIN: "no candidate gains enough on held-out runs",
         Reason.SMALL_SIZE: f"{tried or 'what candidates gain'} moves predictions 5 s ahead by less than "
-        f"{number(figure, 2)} m (1 % of the error at constant speeds), or is late by less than half a step",
+        f"{number(figure, 2)} m or half a step",
         Reason.SMALL_SHARE: f"{tried} explains only {figure:.0%} of what can be explained",
         Reason.CLOSED_LOOP: f"{tried} makes free simulation worse",
         Reason.TEST_SET: f"the test set does not confirm {tried}",
@@ -206,8 +206,8 @@ def headline(
         return "Nothing is missing that these data could show: no candidate lowers the held-out error."
     if verdict is Verdict.CANNOT_TELL:
         powerless = refusal is not None and refusal.reason is Reason.NO_POWER
-        needed = "more runs, ten or more," if powerless else "four runs of three followers or seven runs, better ten,"
-        return f"These data cannot tell: {reason(refusal, tried)}; {needed} are needed (a quarter is the test set)."
+        needed = "More runs, ten or more," if powerless else "Four runs of three followers or seven runs, better ten,"
+        return f"These data cannot tell: {reason(refusal, tried)}. {needed} are needed (a quarter is the test set)."
     if refusal is not None and refusal.reason is Reason.HELD_OUT:
         return (
             f"Something is missing, but no candidate predicts better: {tried} was selected, and "
@@ -224,6 +224,10 @@ def beside_noise(verdict: Verdict, law: str, left_m: float, floor_m: float, ladd
         drivers += f" of σ = {number(ladder.unsteady[0], 2)} m/s² (memory {number(ladder.unsteady[1], 2)} s)"
     if verdict is Verdict.NONE:
         return f"{error}: {drivers} do so. Nothing is missing that these data could show."
+    if verdict is Verdict.UNDECIDED and ladder is not None and ladder.few:
+        who = ", ".join(ladder.few[:MANY]) + (" and others" if len(ladder.few) > MANY else "")
+        few = f"Half of its square lies with {len(ladder.few)} of the drivers ({who}), where noise of all would not"
+        return f"{error}. {few}. An effect of a form that was not tried, which few meet, would explain it."
     if verdict is Verdict.UNDECIDED:
         return f"{error}. U{drivers[1:]} would explain it, and so would an effect of a form that was not tried."
     return f"{error}. No candidate explains it. {' '.join(tails(ladder))}"
@@ -366,6 +370,7 @@ def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
 def law_details(law: Law, on: bool) -> list[str]:
     """Return a better law's title and number of parameters, and where to go on; ``on`` it effects were found."""
     more = [] if law.own or on else [f"What it lacks: explain --base {law.law.kind}."]
+    more += [f"Each driver has strengths of his own: {', '.join(map(plain, law.own))}."] if law.own else []
     return [f"The law is {law.title}, with {law.parameters} parameters a driver, calibrated as all others.", *more]
 
 

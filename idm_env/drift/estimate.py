@@ -30,6 +30,8 @@ from idm_env.simulator import Simulator
 
 JITTER = (0.005, 2.0)
 """Least and most white acceleration (m/s per √s)."""
+SLOWEST_S = 300.0
+"""Longest τ that is tried: drift beyond it is a driver's own parameters."""
 QUIETEST = 0.01
 """Least noise of measurement (m and m/s)."""
 NUDGE = 0.02
@@ -121,6 +123,8 @@ class Estimate:
         for j in range(drifts):
             if packed[j] < limits[j, 0] + NEAR:
                 continue  # no drift at all, and τ of nothing
+            if packed[drifts + j] > limits[drifts + j, 1] - 1e-6:
+                return f"tau is at {SLOWEST_S:.0f} s, the longest that is tried: slower than these records tell"
             for i, symbol in ((j, "sigma"), (drifts + j, "tau")):
                 if packed[i] > limits[i, 1] - 1e-6 or packed[i] < limits[i, 0] + 1e-6:
                     return f"{symbol} is at the end of what is searched, {math.exp(packed[i]):.3g}"
@@ -238,7 +242,7 @@ def _names(drivers: MeasuredDrivers) -> tuple[str, ...]:
 def _limits(drivers: MeasuredDrivers, noise: tuple[float, float] | None) -> np.ndarray:
     parameters = catalogue(drivers.simulator.effects)
     highest = [parameters[f"{n}.sigma"].high for n in drivers.drifts]
-    drifts = [(1e-3 * x, x) for x in highest] + [(2.0 * drivers.batch.dt, 300.0)] * len(highest)
+    drifts = [(1e-3 * x, x) for x in highest] + [(2.0 * drivers.batch.dt, SLOWEST_S)] * len(highest)
     both = [(QUIETEST, 5.0)] * 2 if noise is None else [(x, x) for x in noise]
     return np.log([*drifts, *both, JITTER])
 

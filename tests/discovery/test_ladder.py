@@ -53,12 +53,16 @@ def at_starts(records: Records) -> np.ndarray:
 @pytest.mark.parametrize("carry", [0.0, 0.6])
 def test_what_lasts_in_a_driver_is_drift_and_no_structure(records: Records, carry: float) -> None:
     found = climbed(records, noise(records, carry))
-    assert not found.unnamed and found.parts["structure without a name"] < 0.02
+    assert not found.unnamed and found.parts["systematic, unidentified"] < 0.02
     assert sum(found.parts.values()) == pytest.approx(1.0)
     assert (found.rungs_m["drift followed"] < 0.95 * found.rungs_m["own"]) == (carry > 0.0)
     # Of errors that carry on by 0.6 a third is foreseen by the last two; of new ones nothing.
-    assert (0.2 < found.parts["drift"] < 0.45) if carry else found.parts["drift"] < 0.02
-    assert found.parts["not foreseen"] > 0.5
+    assert (
+        (0.2 < found.parts["intra-driver variability"] < 0.45)
+        if carry
+        else found.parts["intra-driver variability"] < 0.02
+    )
+    assert found.parts["unexplained"] > 0.5
     assert found.ten_s_m == {name: pytest.approx(2.0 * found.rungs_m[name]) for name in ("all", "own")}
     assert set(found.free_m) == {"all", "own"}
     # Of normal errors whose width is known the CRPS is σ/√π; the width is that of some other windows of the driver.
@@ -72,7 +76,7 @@ def test_what_the_scene_tells_is_structure(records: Records) -> None:
     part *= 0.5 / part.std()
     found = climbed(records, noise(records, 0.3) + part)
     assert found.unnamed and 0.2 < found.structure.share < 0.6
-    assert found.parts["structure without a name"] == pytest.approx(found.structure.share, abs=1e-6)
+    assert found.parts["systematic, unidentified"] == pytest.approx(found.structure.share, abs=1e-6)
 
 
 @pytest.mark.parametrize("slope", [0.0, 1.5, -1.5])

@@ -27,6 +27,21 @@ def test_errors_somewhere_lie_together_and_it_is_told_where(platoon: Records) ->
     assert worst is not None and worst.where == "while the leader brakes" and worst.share > 0.8
 
 
+def test_few_drivers_who_hold_the_error_are_named_and_no_noise_of_all(platoon: Records) -> None:
+    """A sentence said that noise of all drivers would explain what few of them met."""
+    rows = windows(platoon)
+    few = np.unique(rows.group)[:3]
+    names = tails.held_by(rows, np.where(np.isin(rows.group, few), 10.0, 0.1))
+    assert len(names) == 2 and set(names) < {platoon.groups[group] for group in few}
+    usual = told(0.5, 0.5)
+    alike, uneven = (
+        words.beside_noise(Verdict.UNDECIDED, "IDM", 0.56, 0.1, ladder_)
+        for ladder_ in (usual, SimpleNamespace(**(vars(usual) | {"few": names})))
+    )
+    assert "Unsteady drivers" in alike and not any(name in alike for name in names)
+    assert "Unsteady" not in uneven and f"2 of the drivers ({', '.join(names)})" in uneven
+
+
 def told(
     p_scene: float,
     p_tails: float,
@@ -39,6 +54,7 @@ def told(
     made = SimpleNamespace(
         agreement=Agreement(0.01, p_scene, 39), tails=Agreement(0.42, p_tails, 39, usual), worst=worst,
         unsteady=(0.21, 4.0), uneven=uneven, sizes=Agreement(0.1, p_sizes, 39), past=Agreement(foreseen, 0.025, 39),
+        few=(),
     )  # fmt: skip
     made.agrees = Ladder.agrees.fget(made)  # type: ignore[attr-defined]
     return made  # type: ignore[return-value]

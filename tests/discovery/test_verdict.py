@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -329,10 +330,19 @@ def test_words_of_none_claim_no_cause() -> None:
 
 def test_whoever_gave_seven_runs_is_not_told_that_seven_are_needed() -> None:
     few = words.headline(Verdict.CANNOT_TELL, [], Refusal(Reason.FEW_RUNS, 2), "", {})
-    assert "only 2 runs are left" in few and "four runs of three followers or seven runs, better ten, are needed" in few
+    assert "only 2 runs are left" in few and "Four runs of three followers or seven runs, better ten, are needed" in few
     weak = words.headline(Verdict.CANNOT_TELL, [], Refusal(Reason.NO_POWER, 5), "", {})
     assert "the 5 runs left for model selection would not have shown most effects" in weak
-    assert "more runs, ten or more, are needed" in weak
+    assert "More runs, ten or more, are needed" in weak
+
+
+@pytest.mark.parametrize("reason", [*Reason])
+@pytest.mark.parametrize("concluded", [Verdict.NONE, Verdict.CANNOT_TELL, Verdict.UNEXPLAINED])
+def test_a_first_sentence_has_thirty_words_at_most(concluded: Verdict, reason: Reason) -> None:
+    tried = "stiffness of the pull to one's own gap"
+    text = words.headline(concluded, [], Refusal(reason, 0.25), tried, {})
+    first = re.split(r"(?<=[.:]) (?=[A-Z])", text)[0]
+    assert len(first.split()) <= 30, first
 
 
 def test_ceilings_are_told_with_the_smooth_function_and_the_sensors(lag: Discovery) -> None:

@@ -190,7 +190,10 @@ def test_what_is_not_finite_or_at_a_limit_is_not_estimated(monkeypatch: pytest.M
     for broken, why in (
         (replace(right, log_likelihood=math.nan), "not finite"),
         (replace(right, log_likelihood=math.inf), "not finite"),
-        (replace(right, settings=replace(right.settings, memory_time=np.array([300.0]))), "tau"),
+        (
+            replace(right, settings=replace(right.settings, memory_time=np.array([300.0]))),
+            "slower than these records tell",
+        ),
     ):
         assert why in broken.why_not and not right.why_not
         answers = iter((steady, broken, right))
