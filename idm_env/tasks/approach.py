@@ -123,8 +123,8 @@ class ApproachTask(OpenLanesTask):
         return (*super().rules, Signal())
 
     @cached_property
-    def _ranges(self) -> dict[tuple[str, str], tuple[float, float]]:
-        return {("signal", "offset"): (0.0, self.cycle), **super()._ranges}
+    def _ranges(self) -> dict[str, tuple[float, float]]:
+        return {"signal.offset": (0.0, self.cycle), **super()._ranges}
 
     def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
         """Return checked parameters as tensors; ValueError for a signal elsewhere, as observations count from it."""

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from idm_env.effects import Control, Effect, Noise
-from idm_env.parameters import catalogue
+from idm_env.parameters import catalogue, replaced
 from idm_env.roads import Road
 from idm_env.simulator import Simulator, stacked
 from idm_env.tasks.behaviour import Behaviour, behaviour
@@ -291,8 +291,7 @@ class Task(abc.ABC):
 
     @cached_property
     def _behaviour(self) -> Behaviour:
-        extra = self.machinery
-        own = {effect: dict(values) for effect, values in self.own_parameters.items()}
+        extra, own = self.machinery, self.own_parameters
         if self.noise:
             extra += (Noise(),)
         model = behaviour(
@@ -339,20 +338,17 @@ class Task(abc.ABC):
         return next(iter(params[self.simulator.base.name].values()))
 
     @cached_property
-    def _ranges(self) -> dict[tuple[str, str], tuple[float, float]]:
-        """What is drawn for every episode, and the ends of its range."""
+    def _ranges(self) -> dict[str, tuple[float, float]]:
+        """What is drawn for every episode, by its full name, and the ends of its range."""
         drivers = self.randomise
         if isinstance(drivers, Mapping):
             drivers = {name: value for name, value in drivers.items() if name not in self.can_draw}
         spans = ranges_of(drivers)
         below = {full for full, p in catalogue(self._behaviour.effects).items() if p.most}
         for end in ("lowest", "highest", "nearest") if spans else ():  # the last: what another bounds, against it
-            values = {effect: dict(part) for effect, part in self._behaviour.parameters.items()}
-            for (effect, name), ends in spans.items():
-                high = end == "highest" or (end == "nearest" and f"{effect}.{name}" in below)
-                values.setdefault(effect, {})[name] = ends[high]
-            ends_of = replace(self._behaviour, parameters=values)
-            self.simulator.check(ends_of.params(self.vehicles, torch.float64, "cpu"))
+            ends = {full: x[end == "highest" or (end == "nearest" and full in below)] for full, x in spans.items()}
+            model = replace(self._behaviour, parameters=replaced(self._behaviour.parameters, ends))
+            self.simulator.check(model.params(self.vehicles, torch.float64, "cpu"))
         return spans
 
     @cached_property
@@ -439,17 +435,15 @@ class Task(abc.ABC):
         who, where = episode.get("driver"), episode.get("randomised")
         if who is None and where is None:
             return params
-        result = {effect: dict(values) for effect, values in params.items()}
-        dtype = self.like(params).dtype
+        changes, dtype = dict[str, Tensor](), self.like(params).dtype
         if who is not None:
-            for (effect, name), values in self._behaviour.drivers.items():
-                table = self.constant(f"drivers' {effect}.{name}", np.array(values), who.device, dtype)
-                result[effect][name] = table[who]
+            for full, values in self._behaviour.drivers.items():
+                changes[full] = self.constant(f"drivers' {full}", np.array(values), who.device, dtype)[who]
         if where is not None:
-            for i, ((effect, name), (low, high)) in enumerate(self._ranges.items()):
+            for i, (full, (low, high)) in enumerate(self._ranges.items()):
                 number = (low + (high - low) * where[:, i : i + 1]).to(dtype)
-                result.setdefault(effect, {})[name] = number.expand(-1, self.vehicles)
-        return result
+                changes[full] = number.expand(-1, self.vehicles)
+        return replaced(params, changes)
 
     def _unsteady(self, world: EnvState, draw: Draw) -> EnvState:
         """Return the worlds with drivers who drift as they are in the long run, rather than all at their mean."""

@@ -18,14 +18,14 @@ from idm_env.simulator import Integration
 class Behaviour:
     """Effects, the values that differ from their defaults, and how they are integrated.
 
-    ``drivers`` has, of every parameter in which drivers differ (effect and name), the value of each of them.
+    ``drivers`` has, of every parameter in which drivers differ (by full name), the value of each of them.
     """
 
     effects: tuple[Effect, ...]
     parameters: dict[str, dict[str, Any]]
     dt: float
     integration: Integration
-    drivers: dict[tuple[str, str], tuple[float, ...]] = field(default_factory=dict)
+    drivers: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
     def params(self, vehicles: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
         """Return tensors; a list must have one value per vehicle."""
@@ -49,7 +49,7 @@ def _tensor(name: str, value: Any, vehicles: int, dtype: torch.dtype, device: to
 def behaviour(
     own: tuple[Effect, ...],
     required: tuple[Effect, ...],
-    own_parameters: dict[str, dict[str, Any]],
+    own_parameters: Mapping[str, Mapping[str, Any]],
     effects: str | Sequence[str | Mapping[str, Any] | Effect],
     changes: Mapping[str, Any] | None,
     dt: float | None,
@@ -64,7 +64,7 @@ def behaviour(
     drivers, of whom these are kept.
     ValueError where both are given.
     """
-    values, single = own_parameters, dict[tuple[str, str], tuple[float, ...]]()
+    values, single = own_parameters, dict[str, tuple[float, ...]]()
     if drivers is not None and effects:
         raise ValueError(
             f"drivers = {str(drivers)!r} has effects of its own, and effects = {effects!r} are given as well. Give one."
@@ -73,7 +73,7 @@ def behaviour(
         model = load_model(effects if drivers is None else drivers)  # type: ignore[arg-type]
         if drivers is not None:
             single = _single(model, drivers)
-        chosen, values = list(model.effects), {e: dict(v) for e, v in model.parameters.items()}
+        chosen, values = list(model.effects), model.parameters
         dt = model.dt if dt is None else dt
         integration = model.integration if integration is None else integration
     else:
@@ -85,20 +85,20 @@ def behaviour(
     names = {e.name for e in chosen}
     machinery = [e for e in required if e.name not in names]
     chosen += machinery
-    values = {e.name: own_parameters[e.name] for e in machinery if e.name in own_parameters} | values
-    all_names = {e.name for e in chosen}
-    values = {effect: dict(part) for effect, part in values.items() if effect in all_names}
+    machines = {e.name: own_parameters[e.name] for e in machinery if e.name in own_parameters}
+    all_names = names | {e.name for e in machinery}
+    merged = {effect: dict(part) for effect, part in {**machines, **values}.items() if effect in all_names}
     for key, change in nested({} if changes is None else changes).items():
-        values.setdefault(key, {}).update(change)
-        single = {name: x for name, x in single.items() if name[0] != key or name[1] not in change}
+        merged.setdefault(key, {}).update(change)
+        single = {full: x for full, x in single.items() if full not in {f"{key}.{name}" for name in change}}
     step, scheme = number("dt", 0.1 if dt is None else dt), "ballistic" if integration is None else integration
-    return Behaviour(tuple(chosen), values, step, cast(Integration, scheme), single)
+    return Behaviour(tuple(chosen), merged, step, cast(Integration, scheme), single)
 
 
-def _single(model: Model, path: str | Path) -> dict[tuple[str, str], tuple[float, ...]]:
+def _single(model: Model, path: str | Path) -> dict[str, tuple[float, ...]]:
     """Return what the drivers of a model differ in."""
     if not model.drivers:
         raise ValueError(f"{path} has no single drivers to draw. Give a model.yaml of `idm-env fit --by driver`.")
     names = dict.fromkeys((e, n) for layer in model.drivers.values() for e, values in layer.items() for n in values)
     everybody = [model.params(driver, dtype=torch.float64) for driver in model.drivers]
-    return {(e, n): tuple(float(own[e][n]) for own in everybody) for e, n in names}
+    return {f"{e}.{n}": tuple(float(own[e][n]) for own in everybody) for e, n in names}

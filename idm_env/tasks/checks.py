@@ -152,10 +152,10 @@ def span(name: str, value: Any, low: float, unit: str, high: float = math.inf) -
     return first, last
 
 
-def ranges_of(randomise: Mapping[str, Any] | None) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return what episodes draw parameters from, by effect and name. ValueError for what is no range."""
+def ranges_of(randomise: Mapping[str, Any] | None) -> dict[str, tuple[float, float]]:
+    """Return what episodes draw parameters from, by full name. ValueError for what is no range."""
     parts = nested({} if randomise is None else randomise, "randomise").items()
-    return {(e, name): two_ends(f"randomise.{e}.{name}", x) for e, part in parts for name, x in part.items()}
+    return {f"{e}.{name}": two_ends(f"randomise.{e}.{name}", x) for e, part in parts for name, x in part.items()}
 
 
 def two_ends(name: str, value: Any) -> tuple[float, float]:

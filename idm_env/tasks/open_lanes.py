@@ -254,7 +254,7 @@ class OpenLanesTask(LanesTask):
         if not self._classes:
             return values
         base = self.simulator.base.name
-        factors = {(base, "desired_speed"): self.spread_factor(dtype, device)} if self.spread else {}
+        factors = {f"{base}.desired_speed": self.spread_factor(dtype, device)} if self.spread else {}
         values = with_classes(values, self.kinds, self._classes, factors)
         self.simulator.check(values)
         return values

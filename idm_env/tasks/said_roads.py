@@ -135,11 +135,11 @@ def with_classes(
     values: dict[str, dict[str, Tensor]],
     kinds: Sequence[str],
     classes: Mapping[str, DriverClass],
-    factors: Mapping[tuple[str, str], Tensor],
+    factors: Mapping[str, Tensor],
 ) -> dict[str, dict[str, Tensor]]:
     """Return the parameters in which those of a class have its numbers, times a factor for each vehicle, if any.
 
-    ValueError for a parameter that is not there.
+    ``factors`` are by full name. ValueError for a parameter that is not there.
     """
     result = {effect: dict(part) for effect, part in values.items()}
     for name, group in classes.items():
@@ -150,6 +150,6 @@ def with_classes(
                 if old is None:
                     raise ValueError(f"classes.{name}: parameter '{effect}.{parameter}' does not exist here.")
                 new = torch.full((len(kinds),), number, dtype=old.dtype, device=old.device)
-                new = new * factors.get((effect, parameter), 1.0)
+                new = new * factors.get(f"{effect}.{parameter}", 1.0)
                 result[effect][parameter] = torch.where(mine.to(old.device), new, old)
     return result

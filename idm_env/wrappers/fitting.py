@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from idm_env.effects import Replay
-from idm_env.parameters import catalogue, constrain, unconstrain
+from idm_env.parameters import catalogue, constrain, replaced, unconstrain
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 from idm_env.tasks import Task
@@ -147,11 +147,8 @@ class ParameterFitting:
         owner = getattr(self.env, "unwrapped", self.env)
         if not hasattr(owner, "params"):
             raise ValueError("this environment has no parameters to set. Wrap a Gymnasium environment of this package.")
-        params = {effect: dict(part) for effect, part in owner.params.items()}
-        for name, value in self.values().items():
-            effect, parameter = name.split(".")
-            params[effect][parameter] = value[group].detach().to(params[effect][parameter])
-        owner.params = params
+        like = owner.task.like(owner.params)
+        owner.params = replaced(owner.params, {name: x[group].detach().to(like) for name, x in self.values().items()})
 
     def model(self, group: int = 0) -> Any:
         """Return the values of one group as an ``idm_env.model_file.Model``, for ``save_model`` and ``effects=``."""
