@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from idm_env import delay_buffer, effects as known
+from idm_env.compiled.kernels import threads
 from idm_env.compiled.records import march_loops
 from idm_env.compiled.scalar import library
 from idm_env.compiled.scalar.graph import Leaf, TimeStep
@@ -52,17 +53,22 @@ COLUMNS += ("behind_front", "behind_speed", "behind_accel", "behind_present")
 COLUMNS += ("beside_distance", "beside_speed", "beside_present")
 COLUMNS += ("position", "speed", "accel", "time", "place", "pushed")
 
-_SEEN: dict[Leaf, str] = {Leaf("position"): "place", **{Leaf(name): name for name in ("speed", "accel", "gap")}}
-_SEEN |= {Leaf("length"): "own_length", Leaf("step"): "(time * per_dt)", Leaf("led"): "1.0"}
-_SEEN |= {Leaf("speed", 1): "lead_speed", Leaf("accel", 1): "lead_accel", Leaf("led", 1): "signals[i, 6]"}
+
+def _column(name: str) -> str:
+    return f"state[COLUMN + {COLUMNS.index(name)}]"
+
+
+_SEEN: dict[Leaf, str] = {Leaf(n): f"state[{n.upper()}]" for n in ("speed", "accel", "gap", "length", "step")}
+_SEEN |= {Leaf("position"): "state[PLACE]", Leaf("led"): "1.0", Leaf("led", 1): _column("second_present")}
+_SEEN |= {Leaf("speed", 1): "state[LEAD_SPEED]", Leaf("accel", 1): "state[LEAD_ACCEL]"}
 # A gap to the second leader is counted from the leader's rear, whose length is then not needed.
-_SEEN |= {Leaf("length", 1): "0.0", Leaf("gap", 1): "(signals[i, 3] - signals[i, 0])"}
-_SEEN |= {Leaf("speed", 2): "signals[i, 4]", Leaf("accel", 2): "signals[i, 5]"}
-_SEEN |= {Leaf("leads"): "signals[i, 10]", Leaf("led", -1): "1.0"}
-_SEEN |= {Leaf("gap", -1): "(position - own_length - signals[i, 7])"}
-_SEEN |= {Leaf("speed", -1): "signals[i, 8]", Leaf("accel", -1): "signals[i, 9]"}
+_SEEN |= {Leaf("length", 1): "0.0", Leaf("gap", 1): f"({_column('second_rear')} - {_column('lead_rear')})"}
+_SEEN |= {Leaf("speed", 2): _column("second_speed"), Leaf("accel", 2): _column("second_accel")}
+_SEEN |= {Leaf("leads"): _column("behind_present"), Leaf("led", -1): "1.0"}
+_SEEN |= {Leaf("gap", -1): f"(state[POSITION] - state[LENGTH] - {_column('behind_front')})"}
+_SEEN |= {Leaf("speed", -1): _column("behind_speed"), Leaf("accel", -1): _column("behind_accel")}
 """Where the loop has what a step reads."""
-_BESIDE = {"distance": "signals[i, 11]", "speed": "signals[i, 12]", "present": "signals[i, 13]"}
+_BESIDE = {name: _column(f"beside_{name}") for name in ("distance", "speed", "present")}
 
 
 PINNED = 1.0001
@@ -194,16 +200,49 @@ def _default(names: tuple[str, ...]) -> Catalogue:
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A catalogue's compiled loop for one time step."""
+    """A catalogue's compiled loop for one time step; ``reads`` tells what it reads where some effects are at work."""
 
     catalogue: Catalogue
     text: str
     varying: np.ndarray
+    reads: Callable[[frozenset[str]], list[str]]
 
-    @cached_property
-    def march(self) -> Any:
-        """The compiled function of ``march_loops``."""
-        return library.load("march", self.text).march
+    @lru_cache(maxsize=64)  # noqa: B019 (loops are kept as long)
+    def _read(self, working: frozenset[str]) -> tuple[np.ndarray, ...]:
+        """Return the places in φ, and the columns of others, that a step reads with these effects at work."""
+        text = " ".join(self.reads(working))
+        numbers = (re.findall(form, text) for form in (r"\bp\[(\d+)\]", r"COLUMN \+ (\d+)\]"))
+        return tuple(np.array(sorted({int(x) for x in each}), np.int64) for each in numbers)
+
+    def roll(
+        self, rows: Any, theta: np.ndarray, phi: np.ndarray, on: np.ndarray, tables: np.ndarray, pulse: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return gap and speed [C, R, samples] of rows; θ [C, G, P], φ [C, G, …], ``pulse`` [C, 3] or [0, 3]."""
+        records, module = rows.records, library.load("march", self.text)
+        working = [e for e, is_on in zip(self.catalogue.flagged, on, strict=True) if is_on]
+        is_wound, lead = lead_steps(working, records.dt)
+        reads = self._read(frozenset(e.name for e in working))
+        law: tuple[Any, ...] = records.length, theta, phi.reshape(-1, phi.shape[-1]), on, *reads, tables
+        law += back_steps(working, records.dt), records.dt, self.varying
+        wound, out = np.zeros((0, 0, 0)), np.empty((2, len(theta), len(rows), rows.steps // rows.every))
+
+        def split(record: np.ndarray, start: np.ndarray, steps: int, work: int, *winding: np.ndarray) -> None:
+            given: tuple[Any, ...] = records.signals, records.bounds, record, start, records.group[record], *law
+            given += lead, steps, rows.every, pulse, *winding, wound, *out
+            tiles = -(-len(theta) * len(record) // march_loops.LANES)
+            count = threads.count(march_loops.LANES * tiles * work)
+            threads.split(lambda begin, end: module.march(*given, begin, end), tiles, 1, count)
+
+        settle = np.maximum(records.bounds[rows.record], rows.start - lead)
+        if is_wound and module.MEMORIES:
+            wound = np.empty((len(theta), len(rows), module.MEMORIES))
+            order = np.lexsort((settle, rows.record))
+            record, ends = np.unique(rows.record[order], return_index=True)
+            ends = np.append(ends, len(rows))
+            last = settle[order[ends[1:] - 1]]
+            split(record, last, 1, int((last - records.bounds[record]).max(initial=0)), ends, order, settle)
+        split(rows.record, rows.start, rows.steps, rows.steps, *np.zeros((3, 0), np.int64))
+        return out[0], out[1]
 
 
 def why_not_recorded(effect: Effect, dt: float = 0.1) -> str | None:
@@ -218,18 +257,17 @@ def why_not_recorded(effect: Effect, dt: float = 0.1) -> str | None:
 @lru_cache(maxsize=16)
 def loop(catalogue: Catalogue, dt: float) -> Loop:
     """Return the loop of a catalogue; recorded and printed once per process, compiled once per printed text."""
-    text, varying = _printed(catalogue, dt)
-    return Loop(catalogue, text, varying)
+    return _printed(catalogue, dt)
 
 
 def pulsed(catalogue: Catalogue, pulse: np.ndarray, on: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """Set the flags and weights of pulses [copies, 4], (place in ``PULSED`` + 1 or 0, first step, end step, amount).
+    """Set flags [flags] and weights of pulses [copies, 4]: place in ``PULSED`` + 1 or 0, first step, end step, amount.
 
     Returns what the loop takes of them [copies, 3].
     """
     for copy in np.flatnonzero(pulse[:, 0]):
         name, weights = catalogue.shape(PULSED[int(pulse[copy, 0]) - 1], "", PULSE)
-        on[copy, catalogue.flags[name]] = 1
+        on[catalogue.flags[name]] = 1
         for weight, value in weights.items():
             phi[copy, :, catalogue.index[weight]] = value
     return np.ascontiguousarray(pulse[:, 1:])
@@ -241,7 +279,7 @@ def back_steps(effects: Sequence[Effect], dt: float) -> int:
     return delay_buffer.slots(seconds, dt) + 1 if seconds else 0
 
 
-def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
+def _printed(catalogue: Catalogue, dt: float) -> Loop:
     graph = Regions()
     recorded = _recorded(catalogue, dt, graph)
     read_tables = {node.label for node in graph.serial if node.op == "table"}
@@ -250,7 +288,7 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
             raise ValueError(f"effect '{name}' is a profile and does not read it by effects.places.curve.")
     memories = list(recorded.begin)
     driver = {f"{name}.{p.name}": f"th[{i}]" for i, (name, p) in enumerate(catalogue.of_driver)}
-    inputs = {slot_name(e.name, ""): "pulse_now" for e in _slots(PULSE)}
+    inputs = {slot_name(e.name, ""): "state[PULSE]" for e in _slots(PULSE)}
     for effect in catalogue.effects:
         inputs |= {slot_name(effect.name, part): text for part, text in _BESIDE.items()}
 
@@ -272,11 +310,11 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
 
     straight = Straight(graph, read)
     after = recorded.respond
-    moved = [("displacement", after["displacement"]), ("speed_after", after["speed"]), ("accel_after", after["accel"])]
-    remembered = [(f"moved[{j}]", after[f"memory of {m}"]) for j, m in enumerate(memories)]
+    moved = [(f"moved[{name.upper()}]", after[name]) for name in ("displacement", "speed", "accel")]
+    remembered = [(f"memory[{j}]", after[f"memory of {m}"]) for j, m in enumerate(memories)]
     blocks = {
         "sense": straight.lines([(f"h[now, {j}]", node) for j, node in enumerate(recorded.sense)]),
-        "beginning": straight.lines([(f"memory[{j}]", recorded.begin[m]) for j, m in enumerate(memories)]),
+        "beginning": straight.lines([(f"moved[{3 + j}]", recorded.begin[m]) for j, m in enumerate(memories)]),
         "wind": straight.lines(remembered),
         "respond": straight.lines([*moved, *remembered]),
     }
@@ -285,15 +323,14 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
     counts = f"SIGNALS, MEMORIES, CONSTANTS = {max(len(recorded.sense), 1)}, {len(memories)}, {straight.kept}\n"
     text = text.replace("compiled = ", f"{counts}compiled = ", 1)
     for name, lines in blocks.items():
-        text = _pasted(text, name, lines)
-    return text, np.array([float(x) for x in straight.varying.values] or [0.0])
-
-
-def _pasted(text: str, name: str, lines: list[str]) -> str:
-    block = re.search(rf"^( *)# <{name}>\n *# </{name}>\n", text, re.MULTILINE)
-    assert block is not None, name
-    printed = "".join(f"{block[1]}{line}\n" for line in lines)
-    return text[: block.start()] + printed + text[block.end() :]
+        marks = f"    # <{name}>\n    # </{name}>\n"
+        assert marks in text, name
+        text = text.replace(marks, "".join(f"    {line}\n" for line in lines))
+    every = [*after.values(), *recorded.sense, *recorded.begin.values()]
+    varying = np.array([float(x) for x in straight.varying.values] or [0.0])
+    return Loop(
+        catalogue, text, varying, lambda names: [read(x) for x in straight.leaves(every, {f"on {n}" for n in names})]
+    )
 
 
 def _recorded(catalogue: Catalogue, dt: float, graph: Regions) -> Recording:

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.compiled.kernels import threads
 from idm_env.discovery import march
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.noise import Noise
@@ -82,29 +81,14 @@ class Problem:
         self, theta: np.ndarray, model: Hypothesis, values: np.ndarray, pulse: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return predicted gap and speed [C, R, samples]; log θ [C, G, P], values [C, Q] or [C, G, Q]."""
-        rows, records = self.rows, self.rows.records
         if not model.terms and pulse is None:
             model, values = model.bare, values[..., :0]
-        copies = len(theta)
         if values.ndim == 2:
-            values = np.broadcast_to(values[:, None], (copies, self.groups, values.shape[-1]))
-        count = rows.steps // rows.every
-        gap, speed = np.empty((2, copies, len(rows), count))
-        catalogue, dt = model.catalogue, records.dt
+            values = np.broadcast_to(values[:, None], (len(theta), self.groups, values.shape[-1]))
+        catalogue, on = model.catalogue, model.on
         phi = np.ascontiguousarray(model.phi(values))
-        on = np.tile(model.on, (copies, 1))
-        pulse = np.zeros((copies, 3)) if pulse is None else march.pulsed(catalogue, pulse, on, phi)
-        loop, working = march.loop(catalogue, dt), model.at_work
-        law = np.exp(theta), phi, on, model.tables, march.back_steps(working, dt), *march.lead_steps(working, dt)
-
-        def roll(begin: int, end: int) -> None:
-            some, part = slice(begin, end), np.empty((2, copies, end - begin, count))
-            measured = records.signals, records.bounds, rows.record[some], rows.start[some], rows.steps
-            loop.march(*measured, rows.group[some], records.length, *law, rows.every, dt, loop.varying, pulse, *part)
-            gap[:, some], speed[:, some] = part
-
-        threads.split(roll, len(rows), 1, threads.count(copies * len(rows) * rows.steps))
-        return gap, speed
+        pulse = np.zeros((0, 3)) if pulse is None else march.pulsed(catalogue, pulse, on, phi)
+        return march.loop(catalogue, self.rows.records.dt).roll(self.rows, np.exp(theta), phi, on, model.tables, pulse)
 
     def errors(
         self, theta: np.ndarray, model: Hypothesis, values: np.ndarray, pulse: np.ndarray | None = None

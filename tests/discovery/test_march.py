@@ -172,7 +172,7 @@ def test_threads_change_no_bit(platoon: Records, monkeypatch: pytest.MonkeyPatch
     for many in (1, 3):
         monkeypatch.setattr(threads, "count", lambda work, many=many: many)
         ends.append(problem.predict(np.tile(THETA, (1, problem.groups, 1)), model, values))
-    assert np.array_equal(*ends) and len(pieces) == 4
+    assert np.array_equal(*ends) and len(pieces) == 7
 
 
 def test_a_printed_loop_depends_on_no_number() -> None:

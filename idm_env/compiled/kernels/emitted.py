@@ -3,6 +3,9 @@
 What a step or a task says is printed as loops over arrays at addresses: assignments, operations, calls, nothing else.
 numba's analysis of such a text takes a time that grows faster than its length: seven seconds for 300 lines. Here its
 text is walked once. Every operation is numba's own, by its types, so its rounding is; a name has one type at a time.
+
+Where a file has a number of ``LANES``, a subscript that leaves the last dimension out is a row: that many numbers, one
+beside another in a register, and everything that meets one becomes a row. Functions are called lane by lane.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ with needed("a compiled loop"):
     from numba.np.arrayobj import populate_array
     from numba.np.numpy_support import from_dtype
 
+from idm_env.compiled.kernels import functions
 from idm_env.compiled.kernels.memory import located
 
 _BYTE, _WHOLE = ir.IntType(8), ir.IntType(64)
@@ -39,6 +43,12 @@ _OPERATORS |= {ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.USub: operator.n
 _OPERATORS |= {ast.And: operator.and_, ast.Or: operator.or_}
 _CONSTANT = re.compile(r"c|t\d+")
 """Names of arrays of constants."""
+_OF_ROWS: dict[Any, str] = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
+_OF_ROWS |= {operator.neg: "fneg", operator.and_: "and_", operator.or_: "or_", operator.not_: "not_"}
+_TESTS: dict[Any, str] = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">="}
+_TESTS |= {operator.eq: "==", operator.ne: "!="}
+_INTRINSIC: dict[Any, str] = {np.sqrt: "sqrt", abs: "fabs", np.floor: "floor"}
+"""Operations on rows, as LLVM has them."""
 _PLAIN = {bool: types.boolean, int: types.int64, float: types.float64}
 _IN_LINE = {  # such that a NaN in x stays one
     "larger": ast.parse("y if x < y else x", mode="eval").body,
@@ -81,7 +91,7 @@ class Walk:
         self._read: list[tuple[str, Variable]] = []
         self._scopes: dict[str, Any] = {}
         self._accesses: list[tuple[Any, str]] = []
-        self.returned: list[Any] = []
+        self._lanes: int = room.get("LANES", 0)
 
     def run(self, function: ast.FunctionDef, arguments: Sequence[tuple[Any, Any]]) -> None:
         """Emit a function whose arguments have these types and values."""
@@ -110,10 +120,6 @@ class Walk:
     def _pass(self, node: ast.Pass) -> None:
         """Nothing."""
 
-    def _return(self, node: ast.Return) -> None:
-        assert isinstance(node.value, ast.Tuple)
-        self.returned = [self._number(self._value(x)).ir for x in node.value.elts]
-
     def _assign(self, node: ast.Assign) -> None:
         (target,) = node.targets
         if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
@@ -129,6 +135,9 @@ class Walk:
     def _set(self, target: ast.expr, value: Any) -> None:
         if isinstance(target, ast.Subscript):
             to = self._place(target)
+            if isinstance(to.ir.type.pointee, ir.VectorType):
+                self._builder.store(self._rows(value)[0].ir, to.ir, align=8)
+                return
             content = self._context.data_model_manager[to.kind].as_data(self._builder, self._cast(value, to.kind))
             self._apart(self._builder.store(content, to.ir), to.name)
             return
@@ -137,10 +146,10 @@ class Walk:
             has_name = value.name or _CONSTANT.fullmatch(target.id)
             self._names[target.id] = value._replace(name=target.id if has_name else "given")
             return
-        value = self._number(value)
+        value = self._rows(value)[0] if self._lanes else self._number(value)
         slot = self._slots.get((target.id, value.kind))
         if slot is None:
-            slot = cgutils.alloca_once(self._builder, self._context.get_value_type(value.kind), name=target.id)
+            slot = cgutils.alloca_once(self._builder, value.ir.type, name=target.id)
             self._slots[target.id, value.kind] = slot
         self._builder.store(value.ir, slot)
         self._names[target.id] = Variable(value.kind, slot)
@@ -212,6 +221,8 @@ class Walk:
 
     def _subscript(self, node: ast.Subscript) -> Value:
         place = self._place(node)
+        if isinstance(place.ir.type.pointee, ir.VectorType):
+            return Value(place.kind, self._builder.load(place.ir, align=8))
         content = self._builder.load(place.ir)
         self._apart(content, place.name)
         return Value(place.kind, self._context.data_model_manager[place.kind].from_data(self._builder, content))
@@ -233,8 +244,12 @@ class Walk:
         if isinstance(array, Value):
             held = self._context.make_array(array.kind)(self._context, self._builder, array.ir)
             for row in rows:
-                wide = cgutils.unpack_tuple(self._builder, held.shape, 2)[1]
+                wide = cgutils.unpack_tuple(self._builder, held.shape, array.kind.ndim)[1]
                 index = self._builder.add(self._builder.mul(row, wide), index)
+            if self._lanes and len(rows) + 2 == array.kind.ndim:
+                first = self._builder.gep(held.data, [self._builder.mul(index, _WHOLE(self._lanes))])
+                row_type = ir.VectorType(held.data.type.pointee, self._lanes)
+                return Pointer(array.kind.dtype, self._builder.bitcast(first, row_type.as_pointer()))
             array = Pointer(array.kind.dtype, held.data)
         return Pointer(array.kind, self._builder.gep(array.ir, [index]), array.name)
 
@@ -258,6 +273,9 @@ class Walk:
         if not isinstance(test, Value):
             return self._value(node.body if test else node.orelse)
         one, other = self._number(self._value(node.body)), self._number(self._value(node.orelse))
+        if any(map(_is_row, (test, one, other))):
+            (choice,), (one, other) = self._rows(test), self._rows(one, other)
+            return Value(one.kind, self._builder.select(choice.ir, one.ir, other.ir))
         kind = self._context.typing_context.unify_types(one.kind, other.kind)
         chosen = self._builder.select(self._cast(test, types.boolean), self._cast(one, kind), self._cast(other, kind))
         return Value(kind, chosen)
@@ -270,8 +288,6 @@ class Walk:
             self._names = before
             return result
         called, arguments = self._value(node.func), [self._value(x) for x in node.args]
-        if called is choose:
-            return self._chosen(*arguments)
         if called is carray:
             return arguments[0]
         if called is located:
@@ -286,22 +302,12 @@ class Walk:
             return Value(_type_of(called), self._cast(arguments[0], _type_of(called)))
         return self._called(called, arguments)
 
-    def _chosen(self, test: Any, one: Any, other: Any) -> Any:
-        if not isinstance(test, Value):
-            return one if test else other
-        builder, (one, other) = self._builder, map(self._number, (one, other))
-        before = builder.block
-        with builder.if_then(self._cast(test, types.boolean)):
-            inside = builder.block
-        result = builder.phi(one.ir.type)
-        result.add_incoming(one.ir, inside)
-        result.add_incoming(other.ir, before)
-        return Value(one.kind, result)
-
     def _called(self, function: Any, arguments: Sequence[Any]) -> Any:
         """Return what a function makes of numbers: numba's instructions for their types."""
         if not any(isinstance(x, (Value, Pointer)) for x in arguments):
             return function(*arguments)
+        if any(map(_is_row, arguments)):
+            return self._of_rows(function, arguments)
         numbers = [self._array(x) if isinstance(x, Pointer) else self._number(x) for x in arguments]
         kinds = tuple(x.kind for x in numbers)
         if (function, kinds) not in self._calls:
@@ -313,6 +319,65 @@ class Walk:
         for library in getattr(implementation, "libs", ()):
             self._context.active_code_library.add_linking_library(library)
         return Value(call.return_type, implementation(self._builder, values))
+
+    def _of_rows(self, function: Any, arguments: Sequence[Any]) -> Value:
+        """Return what a function makes of rows: one instruction, its own lines on rows, or itself lane by lane."""
+        if getattr(function, "__module__", "") == functions.__name__:
+            return self._in_rows(function, arguments)
+        if not any(function in known for known in (_OF_ROWS, _TESTS, _INTRINSIC)):
+            return self._lane_by_lane(function, arguments)
+        builder, rows = self._builder, self._rows(*arguments)
+        kind, given = rows[0].kind, [x.ir for x in rows]
+        if function in _TESTS:
+            unlike = builder.fcmp_unordered if function is operator.ne else builder.fcmp_ordered
+            test = builder.icmp_signed if kind == types.int64 else unlike
+            return Value(types.boolean, test(_TESTS[function], *given))
+        if function in _INTRINSIC:
+            name = f"llvm.{_INTRINSIC[function]}.v{self._lanes}f64"
+            return Value(kind, builder.call(self._outside(name, given[0].type, given[0].type), given))
+        name = _OF_ROWS[function]
+        return Value(kind, getattr(builder, name[1:] if kind == types.int64 else name)(*given))
+
+    def _in_rows(self, function: Any, arguments: Sequence[Any]) -> Value:
+        """Return what one of ``functions`` makes of rows: its lines are walked here, its intrinsics take rows."""
+        if not hasattr(function, "py_func"):
+            (row,) = arguments
+            made, emit = function._defn(self._context.typing_context, row.kind)
+            return Value(row.kind, emit(self._context, self._builder, made, [row.ir]))
+        lines, before = _functions(functions.__name__)[function.py_func.__name__], (self._names, self._room)
+        self._names = {x.arg: y for x, y in zip(lines.args.args, arguments, strict=True)}
+        self._room = function.py_func.__globals__
+        self._block(lines.body[:-1])
+        result = self._value(lines.body[-1].value)  # type: ignore[attr-defined]
+        self._names, self._room = before
+        return result
+
+    def _lane_by_lane(self, function: Any, arguments: Sequence[Any]) -> Value:
+        builder, each = self._builder, list(arguments)
+        places = {i: cgutils.alloca_once_value(builder, x.ir) for i, x in enumerate(arguments) if _is_row(x)}
+        with cgutils.for_range(builder, _WHOLE(self._lanes)) as loop:
+            for i, place in places.items():
+                first = builder.bitcast(place, each[i].ir.type.element.as_pointer())
+                each[i] = Value(each[i].kind, builder.load(builder.gep(first, [loop.index])))
+            one = self._called(function, each)
+            result = cgutils.alloca_once(builder, ir.VectorType(one.ir.type, self._lanes))
+            first = builder.bitcast(result, one.ir.type.as_pointer())
+            builder.store(one.ir, builder.gep(first, [loop.index]))
+        return Value(one.kind, builder.load(result))
+
+    def _rows(self, *values: Any) -> list[Value]:
+        """Return numbers as rows of one type: that of the first row among them."""
+        numbers = [self._number(x) for x in values]
+        kind = next((x.kind for x in numbers if _is_row(x)), types.float64)
+        return [x if _is_row(x) else Value(kind, self._spread(self._cast(x, kind))) for x in numbers]
+
+    def _spread(self, number: Any) -> Any:
+        row = ir.VectorType(number.type, self._lanes)
+        if isinstance(number, ir.Constant):
+            return ir.Constant(row, [number] * self._lanes)
+        first = self._builder.insert_element(ir.Constant(row, ir.Undefined), number, ir.IntType(32)(0))
+        everywhere = ir.Constant(ir.VectorType(ir.IntType(32), self._lanes), None)
+        return self._builder.shuffle_vector(first, first, everywhere)
 
     def _array(self, pointer: Pointer) -> Value:
         """Return an array, longer than any, of what lies at a pointer."""
@@ -351,24 +416,16 @@ def _type_of(kind: Any) -> Any:
     return from_dtype(np.dtype(kind))
 
 
-def choose(test: Any, one: Any, other: Any) -> Any:
-    """In printed text: one where a test holds, else the other; both are there already, of one type.
+def _is_row(value: Any) -> bool:
+    return isinstance(value, Value) and isinstance(value.ir.type, ir.VectorType)
 
-    A branch, not a selection: what follows need not wait for the one that does not count.
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """Make a printed function one that loops of their file call, and that returns nothing.
+
+    Arrays lie in one piece, of up to three dimensions.
     """
-
-
-def inlined(results: int = 0) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator of printed functions that loops of their file call; they return so many doubles, in a tuple.
-
-    Arrays lie in one piece, of one dimension or two.
-    """
-    returned = types.UniTuple(types.float64, results) if results else types.void
-
-    def wrapped(function: Callable[..., Any]) -> Any:
-        return counted(function.__name__, ", ".join(_names(function)), _typed(function, returned))
-
-    return wrapped
+    return counted(function.__name__, ", ".join(_names(function)), _typed(function))
 
 
 @lru_cache(maxsize=32)
@@ -380,16 +437,16 @@ def _names(function: Callable[..., Any]) -> tuple[str, ...]:
     return function.__code__.co_varnames[: function.__code__.co_argcount]
 
 
-def _typed(function: Callable[..., Any], returned: Any) -> Callable[..., Any]:
+def _typed(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return what gets the types of arguments of a printed function, and returns its signature and who emits it."""
 
     def typed(*given: Any) -> Any:
         def generate(context: Any, builder: Any, made: Any, arguments: Any) -> Any:
             walk = Walk(context, builder, function.__globals__)
             walk.run(_functions(function.__module__)[function.__name__], list(zip(made.args, arguments, strict=True)))
-            return context.make_tuple(builder, returned, walk.returned) if walk.returned else context.get_dummy_value()
+            return context.get_dummy_value()
 
-        return signature(returned, *given), generate
+        return signature(types.void, *given), generate
 
     return typed
 
@@ -399,7 +456,7 @@ def emitted(kind: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def compiled(function: Callable[..., Any]) -> Any:
         parameters = ", ".join(_names(function))
-        body = counted("body", parameters, _typed(function, types.void))
+        body = counted("body", parameters, _typed(function))
         room: dict[str, Any] = {"body": body, "__name__": function.__module__}
         exec(f"def {function.__name__}({parameters}):\n    body({parameters})", room)
         chosen = {"error_model": "numpy"} | options

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,63 +27,63 @@ _LN2_HIGH, _LN2_LOW = 0.693147180369123816490, 1.90821492927058770002e-10
 """ln 2 in two parts, the first with trailing zeros, so that n ln 2 is exact (Cody and Waite 1980)."""
 
 
-def _parts(number: ir.Type, bits: ir.IntType, mantissa: int, kind: types.Float, root: float) -> Any:
-    half = int.from_bytes(np.array(root, str(kind)).tobytes(), "little")
+def _like(x: Any, kind: ir.Type, value: float | None = None) -> Any:
+    """Return a type, or a constant of it, for as many lanes as x has where it is a row of numbers."""
+    many = x.type.count if isinstance(x.type, ir.VectorType) else 0
+    wide = ir.VectorType(kind, many) if many else kind
+    return wide if value is None else ir.Constant(wide, [value] * many if many else value)
+
+
+def _emitted(kind: types.Float, emit: Callable[[Any, Any], Any]) -> Any:
+    """Return an intrinsic: what ``emit`` makes of a builder and a number of this type."""
 
     @intrinsic
-    def parts(typing_context: Any, x: Any) -> Any:
-        """Return n and m with x = m 2^n and m from √½ to √2, for a normal positive number."""
+    def made(typing_context: Any, x: Any) -> Any:
+        return kind(kind), lambda context, builder, signature, arguments: emit(builder, *arguments)
 
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            whole = builder.bitcast(arguments[0], bits)
-            power = builder.ashr(builder.sub(whole, ir.Constant(bits, half)), ir.Constant(bits, mantissa))
-            rest = builder.bitcast(builder.sub(whole, builder.shl(power, ir.Constant(bits, mantissa))), number)
-            return context.make_tuple(builder, signature.return_type, (builder.sitofp(power, number), rest))
-
-        return types.UniTuple(kind, 2)(kind), generate
-
-    return parts
+    return made
 
 
-_parts_of = _parts(ir.DoubleType(), ir.IntType(64), 52, types.float64, _ROOT_HALF)
-_parts_of_single = _parts(ir.FloatType(), ir.IntType(32), 23, types.float32, _ROOT_HALF)
+def _parts(kind: types.Float) -> Iterator[Any]:
+    """Return of x = m 2^n, normal and positive, m from √½ to √2, n and m; and 2^k of what has k in its lowest bits."""
+    single = kind == types.float32
+    number, bits = (ir.FloatType(), ir.IntType(32)) if single else (ir.DoubleType(), ir.IntType(64))
+    mantissa, bias = (23, 127) if single else (52, 1023)
+    half = int.from_bytes(np.array(_ROOT_HALF, str(kind)).tobytes(), "little")
+
+    def whole(builder: Any, x: Any) -> Any:
+        return builder.bitcast(x, _like(x, bits))
+
+    def power(builder: Any, x: Any) -> Any:
+        return builder.ashr(builder.sub(whole(builder, x), _like(x, bits, half)), _like(x, bits, mantissa))
+
+    def rest(builder: Any, x: Any) -> Any:
+        shifted = builder.shl(power(builder, x), _like(x, bits, mantissa))
+        return builder.bitcast(builder.sub(whole(builder, x), shifted), x.type)
+
+    def two_to(builder: Any, x: Any) -> Any:
+        shifted = builder.shl(builder.add(whole(builder, x), _like(x, bits, bias)), _like(x, bits, mantissa))
+        return builder.bitcast(shifted, x.type)
+
+    return (_emitted(kind, emit) for emit in (lambda b, x: b.sitofp(power(b, x), _like(x, number)), rest, two_to))
 
 
-def _exponent(number: ir.Type, bits: ir.IntType, bias: int, mantissa: int, kind: types.Float) -> Any:
-    @intrinsic
-    def power_of_two(typing_context: Any, x: Any) -> Any:
-        """Return 2^n for a number that holds n in its lowest bits."""
-
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            whole = builder.bitcast(arguments[0], bits)
-            shifted = builder.shl(builder.add(whole, ir.Constant(bits, bias)), ir.Constant(bits, mantissa))
-            return builder.bitcast(shifted, number)
-
-        return kind(kind), generate
-
-    return power_of_two
-
-
-_two_to = _exponent(ir.DoubleType(), ir.IntType(64), 1023, 52, types.float64)
-_two_to_single = _exponent(ir.FloatType(), ir.IntType(32), 127, 23, types.float32)
+_exponent_of, _mantissa_of, _two_to = _parts(types.float64)
+_exponent_of_single, _mantissa_of_single, _two_to_single = _parts(types.float32)
 
 
 def _polynomial(kind: types.Float, coefficients: Sequence[float]) -> Any:
     """Return a polynomial of such a number, of coefficients from the highest power down, by Horner's rule."""
     number = ir.FloatType() if kind == types.float32 else ir.DoubleType()
-    highest, *others = (ir.Constant(number, float(np.array(x, str(kind)))) for x in coefficients)
+    highest, *others = (float(np.array(x, str(kind))) for x in coefficients)
 
-    @intrinsic
-    def horner(typing_context: Any, x: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            value = highest
-            for constant in others:
-                value = builder.fadd(builder.fmul(value, arguments[0]), constant)
-            return value
+    def horner(builder: Any, x: Any) -> Any:
+        value = _like(x, number, highest)
+        for each in others:
+            value = builder.fadd(builder.fmul(value, x), _like(x, number, each))
+        return value
 
-        return kind(kind), generate
-
-    return horner
+    return _emitted(kind, horner)
 
 
 def _taylor(degree: int) -> list[float]:
@@ -144,17 +144,31 @@ _artanh_of_single = _polynomial(types.float32, [1.0 / k for k in range(9, 1, -2)
 
 
 @compiler(forceinline=True)
+def _log_of(n, m, lost):
+    s = (m - 1.0) / (m + 1.0)
+    z = s * s
+    return n * _LN2_HIGH + (2.0 * s + (2.0 * s * z * _artanh_of(z) + (n * _LN2_LOW + lost)))
+
+
+@compiler(forceinline=True)
 def log1p_float64(x):
     """Return log(1 + x) of a double, within two units in the last place; −∞ at −1 and nan below."""
     u = 1.0 + x
     # What rounding took from 1 + x, relative to it.
     lost = ((1.0 - (u - x)) if x > 1.0 else (x - (u - 1.0))) / u
-    n, m = _parts_of(u)  # type: ignore[call-arg]
-    s = (m - 1.0) / (m + 1.0)
-    z = s * s
-    y = n * _LN2_HIGH + (2.0 * s + (2.0 * s * z * _artanh_of(z) + (n * _LN2_LOW + lost)))
+    n, m = _exponent_of(u), _mantissa_of(u)  # type: ignore[call-arg]
+    y = _log_of(n, m, lost)
     y = y if u > 0.0 else (-np.inf if u == 0.0 else np.nan)
     return x if x == np.inf else y
+
+
+@compiler(forceinline=True)
+def power_float64(x, y):
+    """Return x^y of doubles, x normal and positive or 0, within |y log x| + 2 units in the last place."""
+    n, m = _exponent_of(x), _mantissa_of(x)  # type: ignore[call-arg]
+    power = exp_float64(y * _log_of(n, m, 0.0))
+    nothing = 0.0 if y > 0.0 else (np.inf if y < 0.0 else 1.0)
+    return power if x > 0.0 else (nothing if x == 0.0 else np.nan)
 
 
 _ZERO, _INFINITE, _NAN = np.float32(0.0), np.float32(np.inf), np.float32(np.nan)
@@ -166,7 +180,7 @@ def log1p_float32(x):
     """Return log(1 + x) of a float, within two units in the last place; −∞ at −1 and nan below."""
     u = _ONE + x
     lost = ((_ONE - (u - x)) if x > _ONE else (x - (u - _ONE))) / u
-    n, m = _parts_of_single(u)  # type: ignore[call-arg]
+    n, m = _exponent_of_single(u), _mantissa_of_single(u)  # type: ignore[call-arg]
     s = (m - _ONE) / (m + _ONE)
     z = s * s
     y = n * _LN2_HIGH_32 + (_TWO * s + (_TWO * s * z * _artanh_of_single(z) + (n * _LN2_LOW_32 + lost)))

@@ -1,6 +1,8 @@
-"""Loop over rows and time of discovery's rollout, without an equation: lines between marks are printed.
+"""Loops over drivers and time of discovery's rollout, without an equation: lines between marks are printed.
 
 This file is a template (``march``). What is printed is walked once (``kernels.emitted``), when numba compiles the loop.
+``LANES`` drivers stand side by side: copies of a row of records and of the next ones. What belongs to each is a row of
+that many numbers, which printed lines work on as one.
 """
 
 # ruff: noqa: F401, F821
@@ -10,165 +12,195 @@ from __future__ import annotations
 import numpy as np
 
 from idm_env.compiled.kernels.compiler import compiler
-from idm_env.compiled.kernels.curves import curve
-from idm_env.compiled.kernels.emitted import choose, inlined
-from idm_env.compiled.kernels.functions import exp_float64 as exp, sigmoid_float64 as sigmoid
+from idm_env.compiled.kernels.curves import column, curve, recall
+from idm_env.compiled.kernels.emitted import inlined
+from idm_env.compiled.kernels.functions import exp_float64 as exp, power_float64 as power, sigmoid_float64 as sigmoid
 
 log1p, tanh = np.log1p, np.tanh
 ROOM = 68
+LANES = 8
+SPEED, ACCEL, DISPLACEMENT, POSITION, GAP, LENGTH, LEAD_SPEED, LEAD_ACCEL, STEP, PLACE, PULSE, OFFSET = range(12)
+"""Rows of ``state``; the first three those of ``moved``, memories at the beginning behind them."""
+COLUMN = 12
+"""The row of ``state`` with the first column of the record; of these those are filled that somebody reads."""
+SAMPLE, LANE, DRIVER, ROW, COPY, ORIGIN, FIRST, LAST = range(8)
+"""Rows of ``at``: the sample of now, the lane, place in φ, row and copy; first sample of the row and of its record."""
 compiled = compiler()
 
 
-@inlined()
-def constants(p, th, k, c, flags):
+@inlined
+def constants(phi, p, th, k, c, flags):
     """Fill ``c`` with what depends on parameters alone."""
     # <constants>
     # </constants>
 
 
-@inlined()
-def sense(
-    signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
-    lead_accel, time, per_dt, place, pulse_now,
-):  # fmt: skip
+@inlined
+def sense(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
     """Fill the past with what drivers could see now."""
     # <sense>
     # </sense>
 
 
-@inlined()
-def beginning(
-    signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
-    lead_accel, time, per_dt, place, pulse_now,
-):  # fmt: skip
-    """Fill memories at the beginning."""
+@inlined
+def beginning(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
+    """Fill ``moved`` with memories at the beginning."""
     # <beginning>
     # </beginning>
 
 
-@inlined()
-def wind(
-    signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
-    lead_accel, time, per_dt, place, pulse_now,
-):  # fmt: skip
-    """Fill ``moved`` with memories Δt later, on the record."""
+@inlined
+def wind(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
+    """Fill ``memory`` with memories Δt later, on the record."""
     # <wind>
     # </wind>
 
 
-@inlined(3)
-def respond(
-    signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
-    lead_accel, time, per_dt, place, pulse_now,
-):  # fmt: skip
-    """Fill ``moved`` with memories Δt later; return displacement, speed and acceleration of the step."""
+@inlined
+def respond(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
+    """Fill ``memory`` with memories Δt later, ``moved`` with speed and acceleration after the step and displacement."""
     # <respond>
     # </respond>
-    return displacement, speed_after, accel_after
+
+
+@compiled
+def seat(tile, at, state, p, th, record, start, group, length, bounds, theta, phi, used):
+    """Give every lane of a tile its copy and row, copies of a row one beside another, and load their parameters."""
+    copies = theta.shape[0]
+    for lane in range(LANES):
+        both = min(tile * LANES + lane, copies * len(record) - 1)
+        row, copy = both // copies, both % copies
+        r, driver = record[row], copy * theta.shape[1] + group[row]
+        at[LANE, lane], at[DRIVER, lane], at[ROW, lane], at[COPY, lane] = lane, driver, row, copy
+        at[ORIGIN, lane], at[FIRST, lane], at[LAST, lane] = start[row], bounds[r], bounds[r + 1] - 1
+        state[LENGTH, lane] = length[r]
+        for j in range(theta.shape[2]):
+            th[j, lane] = theta[copy, group[row], j]
+        for j in used:
+            p[j, lane] = phi[driver, j]
+
+
+@inlined
+def look(signals, at, state, seen, many, t, per_dt):
+    """Set the sample of now, and load what is measured there; up to the origin of a row also the driver's own motion.
+
+    ``seen`` are the columns of others that somebody reads, so many.
+    """
+    sample = larger(at[ORIGIN] + t, at[FIRST])
+    sample = smaller(sample, at[LAST])
+    at[SAMPLE] = sample
+    if t <= 0:
+        state[POSITION], state[SPEED] = column(signals, sample, 14), column(signals, sample, 15)
+        state[OFFSET] = column(signals, sample, 18) - state[POSITION]
+    state[GAP] = column(signals, sample, 0) - state[POSITION]
+    state[LEAD_SPEED], state[LEAD_ACCEL] = column(signals, sample, 1), column(signals, sample, 2)
+    state[STEP] = column(signals, sample, 17) * per_dt
+    state[PLACE] = state[POSITION] + state[OFFSET]
+    for j in range(many):
+        state[COLUMN + seen[j]] = column(signals, sample, seen[j])
+
+
+@inlined
+def hold(signals, at, state, moved, t, until):
+    """Load accelerations: measured ones up to step ``until`` and where a record begins, after that the drivers' own."""
+    measured = column(signals, at[SAMPLE], 16)
+    state[ACCEL] = measured if at[ORIGIN] + t <= at[FIRST] else moved[ACCEL]
+    if t <= until:
+        state[ACCEL] = measured
+
+
+@inlined
+def advance(at, state, moved, t):
+    """Move drivers on; where a record ends a driver keeps its last state."""
+    goes_on = at[ORIGIN] + t < at[LAST]
+    state[SPEED] = moved[SPEED] if goes_on else state[SPEED]
+    state[POSITION] = state[POSITION] + (moved[DISPLACEMENT] if goes_on else 0.0)
+    state[ACCEL] = moved[ACCEL]
+
+
+@compiled
+def push(signals, at, state, t, pulse):
+    """Load the pulses of now."""
+    for lane in range(LANES):
+        begin, end, amount = pulse[at[COPY, lane]]
+        state[PULSE, lane] = amount * signals[at[SAMPLE, lane], 19] if begin <= t < end else 0.0
+
+
+@compiled
+def keep(signals, at, state, t, n, gap_out, speed_out):
+    """Keep a sample."""
+    for lane in range(LANES):
+        copy, row, i = at[COPY, lane], at[ROW, lane], min(at[ORIGIN, lane] + t, at[LAST, lane])
+        gap_out[copy, row, n] = signals[i, 0] - state[POSITION, lane]
+        speed_out[copy, row, n] = state[SPEED, lane]
+
+
+@compiled
+def remember(at, memory, moved, wound, t, begins):
+    """Fill the memories of drivers who are where they begin: as they are ``wound``, or as ``beginning`` has them."""
+    for lane in range(LANES):
+        if t <= begins or at[ORIGIN, lane] + t <= at[FIRST, lane]:
+            for j in range(MEMORIES):
+                memory[j, lane] = wound[at[COPY, lane], at[ROW, lane], j] if wound.size else moved[3 + j, lane]
 
 
 @compiled
 def march(
-    signals, bounds, record, start, steps, group, length, theta, phi, on, tables, back, whole, lead, every, dt, k,
-    pulse, gap_out, speed_out,
+    signals, bounds, record, start, group, length, theta, phi, flags, used, seen, tables, back, dt, k, lead, steps,
+    every, pulse, ends, order, settle, wound, gap_out, speed_out, begin, end,
 ):  # fmt: skip
-    """Roll every row out in every copy and fill ``gap_out`` and ``speed_out`` [copies, rows, samples].
+    """Roll the tiles from ``begin`` to ``end`` out and fill ``gap_out`` and ``speed_out`` [copies, rows, samples].
 
     ``signals`` [samples, columns] holds all records, record r in rows ``bounds[r] : bounds[r + 1]``. Row i starts on
     its measured state at sample ``start[i]`` of ``record[i]`` and runs ``steps`` steps. In ``lead`` steps before that
-    it is placed on the record and responds; ``whole`` winds memories up from the record's beginning. ``theta``
-    [copies, groups, P]; ``phi`` [copies, groups, …] and ``on`` [copies, flags] as a catalogue lays them out;
-    ``tables`` [tables, 3] is (form, number of knots, place in φ); ``back`` is how many steps of the past are kept;
-    ``pulse`` [copies, 3] is (first step, end step, amount), times the last column of ``signals``;
-    ``k`` are constants that depend on dt. Every ``every`` steps a sample is kept; rows in which a record ends keep
-    their last state.
+    it is placed on the record and responds; memories begin there, or are ``wound`` already. ``theta``
+    [copies, groups, P]; ``phi`` [copies · groups, …] and ``flags`` as a catalogue lays them out: what a step reads of φ
+    is ``used``, of others in the record ``seen``; ``tables`` [tables, 3] is (form, number of knots, place in φ);
+    ``back`` is how many steps of the past are kept; ``pulse`` [copies, 3] is (first step, end step, amount), times the
+    last column of ``signals``; ``k`` are constants that depend on dt. Every ``every`` steps a sample is kept; rows in
+    which a record ends keep their last state.
+
+    Where there are ``ends``, ``wound`` [copies, rows, memories] is filled instead: a lane goes through a record from
+    its beginning to ``start``, for rows ``order[ends[i] : ends[i + 1]]``, which begin at the samples ``settle`` [rows].
     """
-    rows, per_dt = len(record), 1.0 / dt
-    longest = 0
-    for r in range(len(bounds) - 1):
-        longest = max(longest, bounds[r + 1] - bounds[r])
-    h = np.empty((longest + 1 if back > 0 else 1, SIGNALS))
-    c = np.empty(CONSTANTS)
-    memory, kept_memory, moved = np.zeros(MEMORIES), np.zeros(MEMORIES), np.zeros(MEMORIES)
-    for copy in range(theta.shape[0]):
-        flags = on[copy]
-        last, kept_at = -1, 0
-        for row in range(rows):
-            r = record[row]
-            th, p = theta[copy, group[row]], phi[copy, group[row]]
-            begin, end, origin, own_length = bounds[r], bounds[r + 1], start[row], length[r]
-            offset = signals[origin, 18] - signals[origin, 14]
-            constants(p, th, k, c, flags)
-            # Up to ``settle`` only memories are wound up, and from there to the origin the whole step, on the record.
-            settle = max(begin, origin - lead)
-            going_on = whole and r == last and kept_at <= settle
-            first = kept_at if going_on else begin if whole else settle
-            for j in range(MEMORIES):
-                memory[j] = kept_memory[j]
-            last = r
-            speed, position, accel = signals[first, 15], signals[first, 14], signals[first, 16]
-            # Before ``first`` only the past is filled.
-            i = first if going_on or back == 0 else max(begin, first - back)
-            while i < origin + steps:
-                if i + 1 >= end:
-                    for j in range((i - origin) // every, steps // every):
-                        gap_out[copy, row, j], speed_out[copy, row, j] = signals[end - 1, 0] - position, speed
-                    break
-                if i <= origin:
-                    position, speed = signals[i, 14], signals[i, 15]
-                    if i <= settle:
-                        accel = signals[i, 16]
-                now = i - begin
-                lead_speed, lead_accel = signals[i, 1], signals[i, 2]
-                gap = signals[i, 0] - position
-                time = signals[i, 17]
-                place = position + offset
-                pulse_now = 0.0
-                if i - origin >= pulse[copy, 0] and i - origin < pulse[copy, 1]:
-                    pulse_now = pulse[copy, 2] * signals[i, 19]
-                if back > 0:
-                    carried = accel
-                    if i < origin:
-                        accel = signals[i, 16]
-                    sense(
-                        signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap,
-                        speed, accel, lead_speed, lead_accel, time, per_dt, place, pulse_now,
-                    )  # fmt: skip
-                    accel = carried
-                if i < first:
-                    i += 1
-                    continue
-                if i == first and not going_on:
-                    beginning(
-                        signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap,
-                        speed, accel, lead_speed, lead_accel, time, per_dt, place, pulse_now,
-                    )  # fmt: skip
-                if i < settle:
-                    wind(
-                        signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap,
-                        speed, accel, lead_speed, lead_accel, time, per_dt, place, pulse_now,
-                    )  # fmt: skip
-                    for j in range(MEMORIES):
-                        memory[j] = moved[j]
-                    i += 1
-                    continue
-                if i == settle:
-                    kept_at = i
-                    for j in range(MEMORIES):
-                        kept_memory[j] = memory[j]
-                displacement, speed_after, accel_after = respond(
-                    signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed,
-                    accel, lead_speed, lead_accel, time, per_dt, place, pulse_now,
-                )  # fmt: skip
-                for j in range(MEMORIES):
-                    memory[j] = moved[j]
-                accel = accel_after
-                i += 1
-                if i <= origin:
-                    continue
-                speed = speed_after
-                position += displacement
-                k_step = i - origin
-                if k_step % every == 0:
-                    gap_out[copy, row, k_step // every - 1] = signals[i, 0] - position
-                    speed_out[copy, row, k_step // every - 1] = speed
+    at, state = np.zeros((8, LANES), np.int64), np.zeros((COLUMN + signals.shape[1], LANES))
+    th, p, c = np.empty((theta.shape[2], LANES)), np.zeros((phi.shape[1], LANES)), np.empty((CONSTANTS, LANES))
+    memory, moved, winds = np.zeros((MEMORIES, LANES)), np.zeros((3 + MEMORIES, LANES)), len(ends) > 0
+    ready = wound[:0] if winds else wound
+    for tile in range(begin, end):
+        seat(tile, at, state, p, th, record, start, group, length, bounds, theta, phi, used)
+        constants(phi, p, th, k, c, flags)
+        following = ends[at[ROW]] if winds else at[ROW]
+        since = at[ORIGIN] - at[FIRST]
+        begins = -since.max() if winds else -lead
+        h = np.empty((steps + back - begins if back > 0 else 1, SIGNALS, LANES))
+        for t in range(begins - back, steps):
+            now = t - begins + back
+            look(signals, at, state, seen, len(seen), t, 1.0 / dt)
+            if len(pulse):
+                push(signals, at, state, t, pulse)
+            if back > 0:
+                if t <= 0:
+                    hold(signals, at, state, moved, t, max(-1, begins))
+                sense(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
+            if t < begins:
+                continue
+            if t <= 0:
+                hold(signals, at, state, moved, t, 0 if winds else begins)
+            if t <= max(begins, -since.min()):
+                beginning(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
+                remember(at, memory, moved, ready, t, begins)
+            if winds:
+                for lane in range(LANES):
+                    stop = ends[at[ROW, lane] + 1]
+                    while following[lane] < stop and settle[order[following[lane]]] == at[ORIGIN, lane] + t:
+                        for j in range(MEMORIES):
+                            wound[at[COPY, lane], order[following[lane]], j] = memory[j, lane]
+                        following[lane] += 1
+                wind(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
+                continue
+            respond(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
+            if t >= 0:
+                advance(at, state, moved, t)
+                if (t + 1) % every == 0:
+                    keep(signals, at, state, t + 1, (t + 1) // every - 1, gap_out, speed_out)

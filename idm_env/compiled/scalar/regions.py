@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from idm_env.compiled.scalar.graph import CONSTANT, DYNAMIC, STATIC, Graph, Leaf, Node
@@ -77,6 +78,12 @@ class _Tabled(dict[str, Any]):
         return Scalar(self._graph, self._graph.node("table", place, label=self._number, level=DYNAMIC))
 
 
+_BEFORE: dict[str, Callable[[str, Any], Any]] = dict.fromkeys(("perceive", "adapt", "limit"), lambda _, first: first)
+_BEFORE |= dict.fromkeys(("accelerate", "initial_memory"), lambda _, scene: 0.0)
+_BEFORE |= {"remember": lambda name, scene: scene.memory[name]}
+"""Hooks, and what there is without them: of the effect's name and the hook's first argument."""
+
+
 class Flagged:
     """An effect behind a flag: a duck with the effect's name, hooks and needs."""
 
@@ -84,10 +91,11 @@ class Flagged:
         self.effect, self._graph, self._flag, self._table = effect, graph, flag, table
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.effect, name)
+        content = getattr(self.effect, name)
+        return partial(self._run, name, content) if name in _BEFORE else content
 
-    def _run(self, hook: Callable[..., Any], before: Any, *args: Any) -> Any:
-        *scenes, p = args
+    def _run(self, name: str, hook: Callable[..., Any], *args: Any) -> Any:
+        (*scenes, p), before = args, _BEFORE[name](self.effect.name, args[0])
         if self._table is not None:
             p = _Tabled(p, self._graph, self._table)
         with self._graph.within(self._flag) as region:
@@ -102,30 +110,6 @@ class Flagged:
             return type(after)(*(self._merge(region, a, b) for a, b in zip(after, before, strict=True)))  # type: ignore[call-arg]
         graph = self._graph
         return Scalar(graph, graph.merged(region, after.node, value_of(graph, before)))
-
-    def perceive(self, scene: Any, p: Any) -> Any:
-        """Run the effect's hook."""
-        return self._run(self.effect.perceive, scene, scene, p)
-
-    def adapt(self, driver: Any, scene: Any, p: Any) -> Any:
-        """Run the effect's hook."""
-        return self._run(self.effect.adapt, driver, driver, scene, p)
-
-    def accelerate(self, scene: Any, driver: Any, p: Any) -> Any:
-        """Run the effect's hook."""
-        return self._run(self.effect.accelerate, 0.0, scene, driver, p)
-
-    def limit(self, accel: Any, scene: Any, driver: Any, p: Any) -> Any:
-        """Run the effect's hook."""
-        return self._run(self.effect.limit, accel, accel, scene, driver, p)
-
-    def remember(self, scene: Any, driver: Any, p: Any) -> Any:
-        """Run the effect's hook."""
-        return self._run(self.effect.remember, scene.memory[self.effect.name], scene, driver, p)
-
-    def initial_memory(self, scene: Any, driver: Any, p: Any) -> Any:
-        """Run the effect's hook."""
-        return self._run(self.effect.initial_memory, 0.0, scene, driver, p)
 
 
 def _nodes(graph: Graph, after: Any, before: Any) -> Any:

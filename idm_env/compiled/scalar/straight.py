@@ -1,21 +1,15 @@
-"""A graph with regions printed as straight-line Python for a loop over one vehicle (``kernels.emitted.inlined``).
+"""A graph with regions printed as straight-line Python for rows of drivers (``kernels.emitted.inlined``).
 
 What depends on parameters alone is printed apart (``constants``), into an array ``c``, before the loop over time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from idm_env.compiled.scalar.graph import DYNAMIC, Leaf, Node, TimeStep
 from idm_env.compiled.scalar.regions import Regions
 from idm_env.compiled.scalar.source import _FORMS, Constants
-
-_STAGED = {**_FORMS, "relu": "choose({0} < 0.0, 0.0, {0})", "clamp_min": "choose({0} < {1}, {1}, {0})"}
-_STAGED |= {"clamp_max": "choose({0} > {1}, {1}, {0})", "maximum": "choose({0} > {1}, {0}, {1})"}
-_STAGED |= {"minimum": "choose({0} < {1}, {0}, {1})", "select": "choose({0}, {1}, {2})"}
-_STAGED |= {"sign": "choose({0} > 0.0, 1.0, choose({0} < 0.0, -1.0, 0.0))"}
-"""Operation → text for ``kernels.emitted``: choices are branches there."""
 
 Read = Callable[[Leaf], str]
 """How an input is read: an expression."""
@@ -48,21 +42,22 @@ class Straight:
         """Return lines that compute what the printed lines need of parameters alone; call it last."""
         return self._print(self._live(list(self._cells), stop=False), {}, self._cells)
 
+    def leaves(self, outputs: Sequence[Node], flags: Collection[str]) -> set[Leaf]:
+        """Return the inputs that outputs depend on where only these flags are not 0."""
+
+        def read(node: Node) -> tuple[Node, ...]:
+            is_off = node.op == "merge" and node.args[0].label.name not in flags  # type: ignore[union-attr]
+            return node.args[2:] if is_off else node.args
+
+        return {node.label for node in _reached(outputs, read) if isinstance(node.label, Leaf)}
+
     @staticmethod
     def _is_fixed(node: Node) -> bool:
         return node.level < DYNAMIC and node.op not in ("constant", "input") and not node.boolean
 
     def _live(self, outputs: Sequence[Node], stop: bool) -> list[Node]:
-        seen: set[Node] = set()
-        stack = list(outputs)
-        while stack:
-            node = stack.pop()
-            if node in seen:
-                continue
-            seen.add(node)
-            if not (stop and self._is_fixed(node)):
-                stack += node.args
-        return sorted(seen, key=self._graph.serial.__getitem__)
+        reached = _reached(outputs, lambda node: () if stop and self._is_fixed(node) else node.args)
+        return sorted(reached, key=self._graph.serial.__getitem__)
 
     def _print(self, live: list[Node], names: dict[Node, str], fixed: dict[Node, str] | None = None) -> list[str]:
         graph, lines, note = self._graph, [], ""
@@ -121,10 +116,24 @@ class Straight:
     def _text(self, node: Node, names: dict[Node, str]) -> str:
         arguments = [self._name(a, names) for a in node.args]
         if node.op == "past":
-            return f"h[larger(now - np.int64({arguments[0]}), 0), {node.label}]"
+            return f"recall(h, now, {arguments[0]}, {node.label}, at[LANE])"
         if node.op == "table":
-            return f"curve(p, {node.label}, tables, {arguments[0]})"
-        return _STAGED[node.op].format(*arguments)
+            return f"curve(phi, at[DRIVER], {node.label}, tables, {arguments[0]})"
+        if node.op == "pow":
+            return f"power({arguments[0]}, {arguments[1]})"
+        return _FORMS[node.op].format(*arguments, zero="0.0", one="1.0")
+
+
+def _reached(outputs: Sequence[Node], read: Callable[[Node], Sequence[Node]]) -> set[Node]:
+    """Return outputs and all that they are made of, as ``read`` tells what each reads."""
+    seen: set[Node] = set()
+    stack = list(outputs)
+    while stack:
+        node = stack.pop()
+        if node not in seen:
+            seen.add(node)
+            stack += read(node)
+    return seen
 
 
 def constant_text(value: float) -> str:
