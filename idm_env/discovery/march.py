@@ -200,7 +200,7 @@ def _default(names: tuple[str, ...]) -> Catalogue:
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A catalogue's compiled loop for one time step; ``reads`` tells what it reads where some effects are at work."""
+    """A catalogue's compiled loop for one time step; ``reads`` gives its inputs' texts for effects at work."""
 
     catalogue: Catalogue
     text: str
@@ -227,11 +227,11 @@ class Loop:
         wound, out = np.zeros((0, 0, 0)), np.empty((2, len(theta), len(rows), rows.steps // rows.every))
 
         def split(record: np.ndarray, start: np.ndarray, steps: int, work: int, *winding: np.ndarray) -> None:
-            given: tuple[Any, ...] = records.signals, records.bounds, record, start, records.group[record], *law
-            given += lead, steps, rows.every, pulse, *winding, wound, *out
+            arguments: tuple[Any, ...] = records.signals, records.bounds, record, start, records.group[record], *law
+            arguments += lead, steps, rows.every, pulse, *winding, wound, *out
             tiles = -(-len(theta) * len(record) // march_loops.LANES)
             count = threads.count(march_loops.LANES * tiles * work)
-            threads.split(lambda begin, end: module.march(*given, begin, end), tiles, 1, count)
+            threads.split(lambda begin, end: module.march(*arguments, begin, end), tiles, 1, count)
 
         settle = np.maximum(records.bounds[rows.record], rows.start - lead)
         if is_wound and module.MEMORIES:

@@ -11,8 +11,11 @@ import math
 import zlib
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from idm_env.compiled.kernels import available, threads
 
 
 def _signed(x: int) -> int:
@@ -22,8 +25,9 @@ def _signed(x: int) -> int:
 GOLDEN = _signed(0x9E3779B97F4A7C15)
 _FIRST = _signed(0xBF58476D1CE4E5B9)
 _SECOND = _signed(0x94D049BB133111EB)
-_LOW = 0xFFFFFFFF
-_AT_ONCE = 1 << 17
+_LOW, _TURN = 0xFFFFFFFF, 2.0 * math.pi * 2.0**-32
+_FACTORS = np.uint64(0x9E3779B97F4A7C15), np.array([0xBF58476D1CE4E5B9, 0x94D049BB133111EB], np.uint64)
+_AT_ONCE = 1 << 14
 """Hashes that are made at once: more would ask the system for fresh memory at every operation."""
 
 
@@ -73,14 +77,30 @@ class Draw(NamedTuple):
         """
         pairs, rows = (width + 1) // 2, len(self.key)
         normals = torch.empty(steps, rows, 2 * pairs, dtype=dtype, device=self.key.device)
-        each = max(1, _AT_ONCE // (rows * pairs)) if self.key.device.type == "cpu" else max(1, steps)
-        for first in range(0, steps, each):
-            part = normals[first : first + each]
-            block = torch.arange(first * pairs + 1, (first + len(part)) * pairs + 1, device=self.key.device)
-            counter = block.view(-1, 1, pairs) + (step * pairs).view(1, -1, 1)
-            z = _mixed(counter.mul_(GOLDEN).add_(self.key.view(1, -1, 1)))
-            high = (z >> 32).bitwise_and_(_LOW)
-            radius = high.to(dtype).add_(0.5).mul_(2.0**-32).log_().mul_(-2.0).sqrt_()
-            angle = z.bitwise_and_(_LOW).to(dtype).mul_(2.0 * math.pi * 2.0**-32)
-            torch.cat((radius * angle.cos(), radius.mul_(angle.sin_())), dim=-1, out=part)
+        is_cpu, mode = self.key.device.type == "cpu", torch.is_inference_mode_enabled()
+        each = max(1, _AT_ONCE // (rows * pairs)) if is_cpu else max(1, steps)
+
+        def fill(begin: int, end: int) -> None:
+            with torch.inference_mode(mode):
+                for first in range(begin, end, each):
+                    part = normals[first : min(first + each, end)]
+                    high, low = self._halves(1 + step * pairs + first * pairs, len(part), pairs, dtype)
+                    radius, angle = high.add_(0.5).mul_(2.0**-32).log_().mul_(-2.0).sqrt_(), low.mul_(_TURN)
+                    torch.mul(radius, angle.cos(), out=part[..., :pairs])
+                    torch.mul(radius, angle.sin_(), out=part[..., pairs:])
+
+        threads.split(fill, steps, 1, threads.count(steps * rows * width) if is_cpu else 1)
         return normals[..., :width]
+
+    def _halves(self, counter: Tensor, steps: int, pairs: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Return both halves of hashes ``(steps, environments, pairs)``, of counters at the first step."""
+        if self.key.device.type == "cpu" and available():
+            from idm_env.compiled.kernels.counter_loops import halves
+
+            high, low = torch.empty(2, steps, len(self.key), pairs, dtype=dtype)
+            keys, begins = (x.numpy().view(np.uint64) for x in (self.key, counter))
+            halves(keys, begins, *_FACTORS, high.numpy(), low.numpy())
+            return high, low
+        counters = torch.arange(steps * pairs, device=self.key.device).view(-1, 1, pairs) + counter.view(1, -1, 1)
+        z = _mixed(counters.mul_(GOLDEN).add_(self.key.view(1, -1, 1)))
+        return (z >> 32).bitwise_and_(_LOW).to(dtype), z.bitwise_and_(_LOW).to(dtype)

@@ -1,7 +1,9 @@
 """Counters as randomness: the same numbers in any order, independent streams, and the right distribution."""
 
+import pytest
 import torch
 
+from idm_env.compiled.kernels import threads
 from idm_env.tasks import Draw, random
 
 
@@ -22,6 +24,21 @@ def test_normals_are_the_same_however_many_are_made_at_once(monkeypatch):
     monkeypatch.setattr(random, "_AT_ONCE", 50)
     assert torch.equal(draw.normals(step, 9, 7, torch.float32), whole)
     assert draw.normals(step, 0, 7, torch.float32).shape == (0, 5, 7)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_compiled_hashes_and_threads_give_the_bits_of_torch(monkeypatch, dtype):
+    draw, step, pieces = Draw.of(torch.arange(5), torch.arange(5) - 2), torch.arange(5) - 9, []
+    whole, split = draw.normals(step, 9, 7, dtype), threads.split
+    monkeypatch.setattr(threads, "count", lambda work: 3)
+    monkeypatch.setattr(
+        threads, "split", lambda run, *how: split(lambda *ends: (pieces.append(ends), run(*ends)), *how)
+    )
+    with torch.inference_mode():
+        assert torch.equal(draw.normals(step, 9, 7, dtype), whole)
+    assert sorted(pieces) == [(0, 3), (3, 6), (6, 9)]
+    monkeypatch.setattr(random, "available", lambda: False)
+    assert torch.equal(draw.normals(step, 9, 7, dtype), whole)
 
 
 def test_rows_are_what_a_single_environment_draws():

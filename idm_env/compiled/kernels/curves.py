@@ -1,4 +1,4 @@
-"""What printed loops look up for one lane after the other: curves in tables, the past, and columns of records.
+"""Look-ups of printed loops, for one lane after the other: curves in tables, the past, and columns of records.
 
 They stand in a file of their own: numba keeps with a compiled loop where each function that it calls was defined, and a
 printed file is not there to be imported in a process that has printed another.
@@ -30,14 +30,14 @@ def column(signals, sample, number):
 @compiler()
 def curve(phi, driver, number, tables, x):
     """Piecewise linear through evenly spaced knots (periodic where a period is given), or a trapezoid."""
-    form, count, at = tables[number, 0], tables[number, 1], np.uint64(tables[number, 2])
+    form, count, place = tables[number, 0], tables[number, 1], np.uint64(tables[number, 2])
     row = np.uint64(driver)
-    first, by, period = phi[row, at], phi[row, at + np.uint64(1)], phi[row, at + np.uint64(3)]
-    knots = at + np.uint64(4)
+    first, by, period = phi[row, place], phi[row, place + np.uint64(1)], phi[row, place + np.uint64(3)]
+    knots = place + np.uint64(4)
     if period > 0.0:
         x = x - period * np.floor(x / period)
     if form == 2:
-        edge = phi[row, at + np.uint64(2)]
+        edge = phi[row, place + np.uint64(2)]
         up = min(max((x - first + edge) / (2.0 * edge), 0.0), 1.0)
         down = min(max((by + edge - x) / (2.0 * edge), 0.0), 1.0)
         return phi[row, knots] * min(up, down)

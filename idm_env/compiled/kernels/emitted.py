@@ -321,29 +321,29 @@ class Walk:
         return Value(call.return_type, implementation(self._builder, values))
 
     def _of_rows(self, function: Any, arguments: Sequence[Any]) -> Value:
-        """Return what a function makes of rows: one instruction, its own lines on rows, or itself lane by lane."""
+        """Return a function of rows: one instruction, its own lines on rows, or itself lane by lane."""
         if getattr(function, "__module__", "") == functions.__name__:
             return self._in_rows(function, arguments)
-        if not any(function in known for known in (_OF_ROWS, _TESTS, _INTRINSIC)):
+        if not any(function in table for table in (_OF_ROWS, _TESTS, _INTRINSIC)):
             return self._lane_by_lane(function, arguments)
         builder, rows = self._builder, self._rows(*arguments)
-        kind, given = rows[0].kind, [x.ir for x in rows]
+        kind, operands = rows[0].kind, [x.ir for x in rows]
         if function in _TESTS:
             unlike = builder.fcmp_unordered if function is operator.ne else builder.fcmp_ordered
             test = builder.icmp_signed if kind == types.int64 else unlike
-            return Value(types.boolean, test(_TESTS[function], *given))
+            return Value(types.boolean, test(_TESTS[function], *operands))
         if function in _INTRINSIC:
             name = f"llvm.{_INTRINSIC[function]}.v{self._lanes}f64"
-            return Value(kind, builder.call(self._outside(name, given[0].type, given[0].type), given))
+            return Value(kind, builder.call(self._outside(name, operands[0].type, operands[0].type), operands))
         name = _OF_ROWS[function]
-        return Value(kind, getattr(builder, name[1:] if kind == types.int64 else name)(*given))
+        return Value(kind, getattr(builder, name[1:] if kind == types.int64 else name)(*operands))
 
     def _in_rows(self, function: Any, arguments: Sequence[Any]) -> Value:
-        """Return what one of ``functions`` makes of rows: its lines are walked here, its intrinsics take rows."""
+        """Return one of ``functions`` of rows: its lines are walked here, its intrinsics take rows."""
         if not hasattr(function, "py_func"):
             (row,) = arguments
-            made, emit = function._defn(self._context.typing_context, row.kind)
-            return Value(row.kind, emit(self._context, self._builder, made, [row.ir]))
+            kinds, emit = function._defn(self._context.typing_context, row.kind)
+            return Value(row.kind, emit(self._context, self._builder, kinds, [row.ir]))
         lines, before = _functions(functions.__name__)[function.py_func.__name__], (self._names, self._room)
         self._names = {x.arg: y for x, y in zip(lines.args.args, arguments, strict=True)}
         self._room = function.py_func.__globals__

@@ -35,7 +35,7 @@ def _like(x: Any, kind: ir.Type, value: float | None = None) -> Any:
 
 
 def _emitted(kind: types.Float, emit: Callable[[Any, Any], Any]) -> Any:
-    """Return an intrinsic: what ``emit`` makes of a builder and a number of this type."""
+    """Return an intrinsic of a number of this type; ``emit`` gets a builder and the number."""
 
     @intrinsic
     def made(typing_context: Any, x: Any) -> Any:
@@ -45,7 +45,7 @@ def _emitted(kind: types.Float, emit: Callable[[Any, Any], Any]) -> Any:
 
 
 def _parts(kind: types.Float) -> Iterator[Any]:
-    """Return of x = m 2^n, normal and positive, m from √½ to √2, n and m; and 2^k of what has k in its lowest bits."""
+    """Return n and m of x = m 2^n, normal and positive, m from √½ to √2; and 2^k of k in the lowest bits of x."""
     single = kind == types.float32
     number, bits = (ir.FloatType(), ir.IntType(32)) if single else (ir.DoubleType(), ir.IntType(64))
     mantissa, bias = (23, 127) if single else (52, 1023)

@@ -24,7 +24,7 @@ SPEED, ACCEL, DISPLACEMENT, POSITION, GAP, LENGTH, LEAD_SPEED, LEAD_ACCEL, STEP,
 COLUMN = 12
 """The row of ``state`` with the first column of the record; of these those are filled that somebody reads."""
 SAMPLE, LANE, DRIVER, ROW, COPY, ORIGIN, FIRST, LAST = range(8)
-"""Rows of ``at``: the sample of now, the lane, place in φ, row and copy; first sample of the row and of its record."""
+"""Rows of ``index``: the sample of now, the lane, place in φ, row, copy; first samples of the row and of its record."""
 compiled = compiler()
 
 
@@ -36,43 +36,43 @@ def constants(phi, p, th, k, c, flags):
 
 
 @inlined
-def sense(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
+def sense(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
     """Fill the past with what drivers could see now."""
     # <sense>
     # </sense>
 
 
 @inlined
-def beginning(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
+def beginning(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
     """Fill ``moved`` with memories at the beginning."""
     # <beginning>
     # </beginning>
 
 
 @inlined
-def wind(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
+def wind(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
     """Fill ``memory`` with memories Δt later, on the record."""
     # <wind>
     # </wind>
 
 
 @inlined
-def respond(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
+def respond(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memory, moved):
     """Fill ``memory`` with memories Δt later, ``moved`` with speed and acceleration after the step and displacement."""
     # <respond>
     # </respond>
 
 
 @compiled
-def seat(tile, at, state, p, th, record, start, group, length, bounds, theta, phi, used):
+def seat(tile, index, state, p, th, record, start, group, length, bounds, theta, phi, used):
     """Give every lane of a tile its copy and row, copies of a row one beside another, and load their parameters."""
     copies = theta.shape[0]
     for lane in range(LANES):
         both = min(tile * LANES + lane, copies * len(record) - 1)
         row, copy = both // copies, both % copies
         r, driver = record[row], copy * theta.shape[1] + group[row]
-        at[LANE, lane], at[DRIVER, lane], at[ROW, lane], at[COPY, lane] = lane, driver, row, copy
-        at[ORIGIN, lane], at[FIRST, lane], at[LAST, lane] = start[row], bounds[r], bounds[r + 1] - 1
+        index[LANE, lane], index[DRIVER, lane], index[ROW, lane], index[COPY, lane] = lane, driver, row, copy
+        index[ORIGIN, lane], index[FIRST, lane], index[LAST, lane] = start[row], bounds[r], bounds[r + 1] - 1
         state[LENGTH, lane] = length[r]
         for j in range(theta.shape[2]):
             th[j, lane] = theta[copy, group[row], j]
@@ -81,14 +81,14 @@ def seat(tile, at, state, p, th, record, start, group, length, bounds, theta, ph
 
 
 @inlined
-def look(signals, at, state, seen, many, t, per_dt):
-    """Set the sample of now, and load what is measured there; up to the origin of a row also the driver's own motion.
+def look(signals, index, state, seen, many, t, per_dt):
+    """Set the sample of now, and load the measurements there; up to the origin of a row also the driver's own motion.
 
     ``seen`` are the columns of others that somebody reads, so many.
     """
-    sample = larger(at[ORIGIN] + t, at[FIRST])
-    sample = smaller(sample, at[LAST])
-    at[SAMPLE] = sample
+    sample = larger(index[ORIGIN] + t, index[FIRST])
+    sample = smaller(sample, index[LAST])
+    index[SAMPLE] = sample
     if t <= 0:
         state[POSITION], state[SPEED] = column(signals, sample, 14), column(signals, sample, 15)
         state[OFFSET] = column(signals, sample, 18) - state[POSITION]
@@ -101,47 +101,47 @@ def look(signals, at, state, seen, many, t, per_dt):
 
 
 @inlined
-def hold(signals, at, state, moved, t, until):
+def hold(signals, index, state, moved, t, until):
     """Load accelerations: measured ones up to step ``until`` and where a record begins, after that the drivers' own."""
-    measured = column(signals, at[SAMPLE], 16)
-    state[ACCEL] = measured if at[ORIGIN] + t <= at[FIRST] else moved[ACCEL]
+    measured = column(signals, index[SAMPLE], 16)
+    state[ACCEL] = measured if index[ORIGIN] + t <= index[FIRST] else moved[ACCEL]
     if t <= until:
         state[ACCEL] = measured
 
 
 @inlined
-def advance(at, state, moved, t):
+def advance(index, state, moved, t):
     """Move drivers on; where a record ends a driver keeps its last state."""
-    goes_on = at[ORIGIN] + t < at[LAST]
+    goes_on = index[ORIGIN] + t < index[LAST]
     state[SPEED] = moved[SPEED] if goes_on else state[SPEED]
     state[POSITION] = state[POSITION] + (moved[DISPLACEMENT] if goes_on else 0.0)
     state[ACCEL] = moved[ACCEL]
 
 
 @compiled
-def push(signals, at, state, t, pulse):
+def push(signals, index, state, t, pulse):
     """Load the pulses of now."""
     for lane in range(LANES):
-        begin, end, amount = pulse[at[COPY, lane]]
-        state[PULSE, lane] = amount * signals[at[SAMPLE, lane], 19] if begin <= t < end else 0.0
+        begin, end, amount = pulse[index[COPY, lane]]
+        state[PULSE, lane] = amount * signals[index[SAMPLE, lane], 19] if begin <= t < end else 0.0
 
 
 @compiled
-def keep(signals, at, state, t, n, gap_out, speed_out):
+def keep(signals, index, state, t, n, gap_out, speed_out):
     """Keep a sample."""
     for lane in range(LANES):
-        copy, row, i = at[COPY, lane], at[ROW, lane], min(at[ORIGIN, lane] + t, at[LAST, lane])
+        copy, row, i = index[COPY, lane], index[ROW, lane], min(index[ORIGIN, lane] + t, index[LAST, lane])
         gap_out[copy, row, n] = signals[i, 0] - state[POSITION, lane]
         speed_out[copy, row, n] = state[SPEED, lane]
 
 
 @compiled
-def remember(at, memory, moved, wound, t, begins):
+def remember(index, memory, moved, wound, t, begins):
     """Fill the memories of drivers who are where they begin: as they are ``wound``, or as ``beginning`` has them."""
     for lane in range(LANES):
-        if t <= begins or at[ORIGIN, lane] + t <= at[FIRST, lane]:
+        if t <= begins or index[ORIGIN, lane] + t <= index[FIRST, lane]:
             for j in range(MEMORIES):
-                memory[j, lane] = wound[at[COPY, lane], at[ROW, lane], j] if wound.size else moved[3 + j, lane]
+                memory[j, lane] = wound[index[COPY, lane], index[ROW, lane], j] if wound.size else moved[3 + j, lane]
 
 
 @compiled
@@ -163,44 +163,44 @@ def march(
     Where there are ``ends``, ``wound`` [copies, rows, memories] is filled instead: a lane goes through a record from
     its beginning to ``start``, for rows ``order[ends[i] : ends[i + 1]]``, which begin at the samples ``settle`` [rows].
     """
-    at, state = np.zeros((8, LANES), np.int64), np.zeros((COLUMN + signals.shape[1], LANES))
+    index, state = np.zeros((8, LANES), np.int64), np.zeros((COLUMN + signals.shape[1], LANES))
     th, p, c = np.empty((theta.shape[2], LANES)), np.zeros((phi.shape[1], LANES)), np.empty((CONSTANTS, LANES))
     memory, moved, winds = np.zeros((MEMORIES, LANES)), np.zeros((3 + MEMORIES, LANES)), len(ends) > 0
     ready = wound[:0] if winds else wound
     for tile in range(begin, end):
-        seat(tile, at, state, p, th, record, start, group, length, bounds, theta, phi, used)
+        seat(tile, index, state, p, th, record, start, group, length, bounds, theta, phi, used)
         constants(phi, p, th, k, c, flags)
-        following = ends[at[ROW]] if winds else at[ROW]
-        since = at[ORIGIN] - at[FIRST]
+        following = ends[index[ROW]] if winds else index[ROW]
+        since = index[ORIGIN] - index[FIRST]
         begins = -since.max() if winds else -lead
         h = np.empty((steps + back - begins if back > 0 else 1, SIGNALS, LANES))
         for t in range(begins - back, steps):
             now = t - begins + back
-            look(signals, at, state, seen, len(seen), t, 1.0 / dt)
+            look(signals, index, state, seen, len(seen), t, 1.0 / dt)
             if len(pulse):
-                push(signals, at, state, t, pulse)
+                push(signals, index, state, t, pulse)
             if back > 0:
                 if t <= 0:
-                    hold(signals, at, state, moved, t, max(-1, begins))
-                sense(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
+                    hold(signals, index, state, moved, t, max(-1, begins))
+                sense(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
             if t < begins:
                 continue
             if t <= 0:
-                hold(signals, at, state, moved, t, 0 if winds else begins)
+                hold(signals, index, state, moved, t, 0 if winds else begins)
             if t <= max(begins, -since.min()):
-                beginning(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
-                remember(at, memory, moved, ready, t, begins)
+                beginning(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
+                remember(index, memory, moved, ready, t, begins)
             if winds:
                 for lane in range(LANES):
-                    stop = ends[at[ROW, lane] + 1]
-                    while following[lane] < stop and settle[order[following[lane]]] == at[ORIGIN, lane] + t:
+                    stop = ends[index[ROW, lane] + 1]
+                    while following[lane] < stop and settle[order[following[lane]]] == index[ORIGIN, lane] + t:
                         for j in range(MEMORIES):
-                            wound[at[COPY, lane], order[following[lane]], j] = memory[j, lane]
+                            wound[index[COPY, lane], order[following[lane]], j] = memory[j, lane]
                         following[lane] += 1
-                wind(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
+                wind(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
                 continue
-            respond(signals, at, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
+            respond(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
             if t >= 0:
-                advance(at, state, moved, t)
+                advance(index, state, moved, t)
                 if (t + 1) % every == 0:
-                    keep(signals, at, state, t + 1, (t + 1) // every - 1, gap_out, speed_out)
+                    keep(signals, index, state, t + 1, (t + 1) // every - 1, gap_out, speed_out)

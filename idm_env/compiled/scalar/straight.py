@@ -116,16 +116,16 @@ class Straight:
     def _text(self, node: Node, names: dict[Node, str]) -> str:
         arguments = [self._name(a, names) for a in node.args]
         if node.op == "past":
-            return f"recall(h, now, {arguments[0]}, {node.label}, at[LANE])"
+            return f"recall(h, now, {arguments[0]}, {node.label}, index[LANE])"
         if node.op == "table":
-            return f"curve(phi, at[DRIVER], {node.label}, tables, {arguments[0]})"
+            return f"curve(phi, index[DRIVER], {node.label}, tables, {arguments[0]})"
         if node.op == "pow":
             return f"power({arguments[0]}, {arguments[1]})"
         return _FORMS[node.op].format(*arguments, zero="0.0", one="1.0")
 
 
 def _reached(outputs: Sequence[Node], read: Callable[[Node], Sequence[Node]]) -> set[Node]:
-    """Return outputs and all that they are made of, as ``read`` tells what each reads."""
+    """Return outputs and all nodes below them; ``read`` gives the arguments of each."""
     seen: set[Node] = set()
     stack = list(outputs)
     while stack:
