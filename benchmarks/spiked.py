@@ -187,8 +187,11 @@ def driven(
     return position, speed
 
 
-def spiked(drivers: Drivers, effect: str, times: float, seed: int) -> Trajectories:
-    """Return trajectories of some of the drivers with an effect, each behind his measured leader, noise as measured."""
+def spiked(drivers: Drivers, effect: str, times: float, seed: int, again: int = 0) -> Trajectories:
+    """Return trajectories of some of the drivers with an effect, each behind his measured leader, noise as measured.
+
+    The same drivers have other noise ``again``.
+    """
     random = np.random.default_rng(seed)
     run_of = [f"{e.run_id}@{e.time_s[0] // STRETCH_S:.0f}" for e in drivers.stretches]
     chosen: list[int] = []
@@ -196,6 +199,7 @@ def spiked(drivers: Drivers, effect: str, times: float, seed: int) -> Trajectori
         if sum(drivers.stretches[i].seconds for i in chosen) > SET_S:
             break
         chosen += [i for i, name in enumerate(run_of) if name == run]
+    random = np.random.default_rng((seed, again)) if again else random
     batch = Batch.stack([drivers.stretches[i] for i in chosen], substeps=1)
     push, block = torch.zeros(batch.steps, len(batch), dtype=torch.float64), round(BLOCK_S / batch.dt)
     for row, e in enumerate(batch.episodes):

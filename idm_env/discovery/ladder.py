@@ -139,6 +139,11 @@ class Ladder:
         return sure if sure > STRUCTURED else 0.0
 
     @property
+    def stands(self) -> bool:
+        """Whether noise of drivers was held against the errors, and not refused by where they are."""
+        return self.tails is not None and not self.tails.is_refused
+
+    @property
     def agrees(self) -> bool:
         """Whether noise of drivers looks like the errors in every test, and not only unlike them in none.
 

@@ -67,7 +67,7 @@ def summarise(
     sentence = words.headline(
         verdict, [f.clause for f in added], refusal, judged.tried, errors, judged.shared, others, law
     )
-    if (verdict in (Verdict.NONE, Verdict.UNDECIDED) and is_large) or refusal == Refusal(Reason.TAILS):
+    if verdict is Verdict.UNDECIDED or (verdict is Verdict.NONE and is_large) or refusal == Refusal(Reason.TAILS):
         sentence = words.beside_noise(verdict, law, *left, judged.ladder)
     after = judged.after if judged.added else before
     of_laws, of_law = _of_laws(judged, drivers[0] if judged.on is not None else drivers[2])
@@ -155,7 +155,7 @@ def _verdict(
         bool(added), any(f.effect for f in added), refusal, structured or unnamed > 0.0, first.left, power,
         judged.shared is not None, apart=not others,
         in_a_state=all(f.where.coordinate in (*STATES, "state", "period") for f in added),
-        exact=judged.is_exact(least), alike=ladder is not None and ladder.agrees,
+        exact=judged.is_exact(least), alike=ladder is not None and ladder.stands,
     )  # fmt: skip
     if verdict is Verdict.NONE and refusal is not None:
         small = judged.is_exact(least) or refusal.reason is Reason.SMALL_SIZE

@@ -99,8 +99,8 @@ def conclude(
         apart: Whether no other effect of the catalogue did about as well as one that was added.
         in_a_state: Whether all that was added acts in a state of the driver, and nothing at a place or a time.
         exact: Whether the model's errors are too small for anything to be missing.
-        alike: Whether noise of drivers looks like the errors in every test: where there is much of it, it leaves more
-            than ``LEFT``.
+        alike: Whether noise of drivers was held against the errors, and is not refused: where there is much of it, it
+            leaves more than ``LEFT``.
     """
     if exact:
         return Verdict.NONE
