@@ -147,10 +147,13 @@ class Search:
         """Score two effects of the catalogue at once, against squares ``before`` [units]; the second gives the name."""
         first, second = (terms.simple(self.base.catalogue.by_name[n]) for n in names)
         self.on_progress(f"round {number}", 0, 1, f"{first.label} + {second.label}")
-        base = replace(solution, model=solution.model.adding(first))
-        # Strong starts: along the direction in which they cancel, weak ones see nothing to improve.
+        model = solution.model.adding(first).adding(second)
+        # Strong starts, fitted whatever they promise: along the direction in which they cancel weak ones see nothing to
+        # improve, and a strong one makes errors larger at first.
         starts = [np.concatenate([solution.values, a, [0.3]]) for a in first.starts]
-        return self._nested(base, second, before, starts, 12)
+        best = min((solve(self.problem, model, solution.theta, s, iterations=5) for s in starts), key=lambda s: s.cost)
+        best = solve(self.problem, model, best.theta, best.values)
+        return Scored(second, best, log_gain(before, held_out(self.problem, best)))
 
     def _nested(
         self,
@@ -158,7 +161,6 @@ class Search:
         term: Term,
         before: np.ndarray,
         starts: Sequence[np.ndarray] | None = None,
-        iterations: int = 8,
         worth: float = 0.0,
         promise: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> Scored:
@@ -177,7 +179,7 @@ class Search:
             first = [solve(self.problem, model, solution.theta, s, iterations=5) for s in promising]
             best = min(first, key=lambda s: s.cost)
             if 0.5 * np.log(solution.cost / best.cost) >= worth:
-                best = solve(self.problem, model, best.theta, best.values, iterations=iterations)
+                best = solve(self.problem, model, best.theta, best.values, iterations=8)
         return Scored(term, best, log_gain(before, held_out(self.problem, best)))
 
     def _promise(
