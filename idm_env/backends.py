@@ -45,12 +45,13 @@ def rollout(*call: Any) -> Any:
     if _off.get() is not None:
         return None
     for place in _entered:
-        if (result := _function(place)(*call)) is not None:
+        if (result := function(place)(*call)) is not None:
             return result
     return None
 
 
 @cache
-def _function(place: str) -> Callable[..., Any]:
+def function(place: str) -> Callable[..., Any]:
+    """Return the function at a place."""
     module, _, name = place.partition(":")
     return getattr(importlib.import_module(module), name)

@@ -50,6 +50,10 @@ class Simulator(CarFollowingStep):
         """
         return super().step(before(self, state, inputs, params), inputs, params)
 
+    def event(self, state: State, params: Params, now: Tensor) -> Any:
+        """Return the decisions of an event on a network, in the rows where it is ``now`` (bool, ``(...)``)."""
+        return backends.function("idm_env.compiled.kernels.networks:event")(self, state, params, now)
+
     def compile(self, *, backend: str = "inductor", dynamic: bool | None = False) -> Simulator:
         """Return this simulator with a compiled step; where nothing can compile it, with one warning, as it is."""
         own = {field.name: getattr(self, field.name) for field in fields(self)}

@@ -292,6 +292,10 @@ class CarFollowingStep:
     def _history(self, state: State) -> PastScenes | None:
         return History(state.memory[PAST], self.dt) if PAST in state.memory else None
 
+    def event(self, state: State, params: Params, now: Tensor) -> Any:
+        """Raise NotImplementedError: the decisions of events on a network, ``(..., n)`` each, are a simulator's."""
+        raise NotImplementedError("events of networks belong to a Simulator.")
+
     def time(self, state: State) -> Tensor:
         """Return the time (s), shaped to broadcast against ``(..., vehicles)``."""
         time = state.step.to(state.position.dtype) * self.dt

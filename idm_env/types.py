@@ -55,7 +55,8 @@ class LaneState(NamedTuple):
     front of another follower than the one who was judged, because he changed himself at the same time.
 
     ``trips`` is None where nobody comes: otherwise who is not present waits for his trip, or has made it. ``moving`` is
-    None until a decision about lanes is made that takes time to do.
+    None until a decision about lanes is made that takes time to do. On a network, where ``lane`` is the link,
+    ``journeys`` say where everybody is going.
     """
 
     lane: Tensor
@@ -67,6 +68,7 @@ class LaneState(NamedTuple):
     unjudged: Tensor
     trips: Trips | None = None
     moving: Moving | None = None
+    journeys: Journeys | None = None
 
 
 LINKS: tuple[str, ...] = LaneState._fields[:7]
@@ -142,6 +144,27 @@ class Moving(NamedTuple):
     origin: Tensor
     until: Tensor
     shadow: Tensor
+
+
+class Journeys(NamedTuple):
+    """Vehicles' ways through a network: whole numbers of shape ``(..., vehicles)`` (int32), or truth values.
+
+    ``routes`` (routes, links) are lists of links, filled with −1, of which a vehicle follows ``route`` and is on link
+    ``hop``. It has been ``told`` to stop at the next line, or has ``reserved`` the junction behind it. Its trip is
+    ``due`` at a step, and ``asks`` for a speed (m/s); it ``entered`` and ``left`` at steps, −1 for not yet.
+    ``phases`` ``(..., signals)`` are what signals show, −1 for what their plan says.
+    """
+
+    routes: Tensor
+    route: Tensor
+    hop: Tensor
+    told: Tensor
+    reserved: Tensor
+    due: Tensor
+    asks: Tensor
+    entered: Tensor
+    left: Tensor
+    phases: Tensor
 
 
 class State(NamedTuple):

@@ -212,9 +212,24 @@ def set_by_hand() -> list[str]:
     return [str(path.relative_to(PACKAGE)) for path in FILES for _ in range(path.read_text().count("# fmt: skip"))]
 
 
+NETWORKS = (
+    *(f"compiled/kernels/{name}.py" for name in ("networks", "network_loops", "network_rows")),
+    *(f"roads/{name}.py" for name in ("network", "network_demand", "journeys", "streets", "ways")),
+    *(f"roads/sumo_{name}.py" for name in ("demand", "files", "network")),
+    *("multilane/junctions.py", "fitting/network_job.py"),
+    "effects/network_rules.py",
+)
+"""Files that networks of roads brought."""
+
+
 def lines_of_code() -> range:
-    """Return a range as long as the package has lines of code: no docstrings, comments and blank lines."""
-    return range(sum(map(code_lines, FILES)))
+    """Return a range as long as all but networks has lines of code: no docstrings, comments and blank lines."""
+    return range(sum(code_lines(path) for path in FILES if str(path.relative_to(PACKAGE)) not in NETWORKS))
+
+
+def lines_of_networks() -> range:
+    """Return a range as long as networks have lines of code."""
+    return range(sum(code_lines(PACKAGE / name) for name in NETWORKS))
 
 
 STEP = (
@@ -272,6 +287,7 @@ def top_level() -> set[str]:
         (classes_named_twice, 7),
         (lines_behind_a_step, 2234),
         (lines_of_code, 35034),
+        (lines_of_networks, 2240),
         (functions_of_many_parameters, 15),
         (high_packages, 1),
         (file_names_twice, 25),

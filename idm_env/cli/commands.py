@@ -544,6 +544,36 @@ def predict(*, scenarios: list[Path], job: options.JobOptions) -> None:
 
 
 @app.command()
+def network(
+    *,
+    net: Path,
+    routes: list[Path],
+    out: Path = options.OUT,
+    seconds: Annotated[float | None, options.Limits(1.0, 1e6, "s")] = None,
+    seed: options.Seed = 0,
+    resume: bool = False,
+) -> None:
+    """Simulate traffic on a network of SUMO: travel times, throughput, queues, a map of speeds and an animation.
+
+    Writes report.html, map.png, animation.gif, and links.csv, trips.csv and over_time.csv.
+
+    Args:
+        net: A network: .net.xml of netconvert or netgenerate, with internal links.
+        routes: Demand: .rou.xml files of vehicles, trips, flows and vTypes.
+        seconds: Length of the run (s); default: until all have arrived, or an hour after the last departure.
+        resume: Go on where an interrupted run stopped.
+    """
+    with shown(console) as report:
+        from idm_env.fitting.network_job import simulate_network
+
+        _work_begins()
+        result = simulate_network(net, routes, out, seconds=seconds, seed=int(seed), resume=resume, on_progress=report)
+    console.print(result["sentence"], soft_wrap=True, highlight=False)
+    skipped = ", ".join(f"{what} {count}" for what, count in result["skipped"].items()) or "nothing was left out"
+    answers.finished(out, f"Data: {skipped}.")
+
+
+@app.command()
 def effects(model: Annotated[Path | None, options.POSITIONAL] = None, cite: bool = False, trust: bool = False) -> None:
     """List the catalogue of effects, or the effects of a model, with their parameters or their publications.
 

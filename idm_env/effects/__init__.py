@@ -16,6 +16,7 @@ from idm_env.effects.idm import *
 from idm_env.effects.lane_changes import *
 from idm_env.effects.limits import *
 from idm_env.effects.neighbours import *
+from idm_env.effects.network_rules import *
 from idm_env.effects.noise import *
 from idm_env.effects.perception import *
 from idm_env.effects.place_speeds import *
@@ -27,7 +28,7 @@ from idm_env.validation import nearest, shown
 
 _FILES = (
     "idm bases limits actions perception neighbours surroundings adaptation time_gaps place_speeds noise free "
-    "road_rules lane_changes"
+    "road_rules network_rules lane_changes"
 )
 ALL: dict[str, type[Effect]] = {
     effect.kind: effect

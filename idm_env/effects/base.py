@@ -66,7 +66,8 @@ class Effect:
     every effect that adapts, accelerates or limits and does not deny it: a simulator with such an effect has tyres
     (``Traction``). ``draws`` marks effects whose input is one standard normal per vehicle and step, which whoever runs
     the simulator draws; the memory of such an effect, if it has one, is a standard normal in the long run. Dataclass
-    fields are the static choices.
+    fields are the static choices. ``guided`` names what events of a network write into the memory of an effect: the
+    place of a closed line (m) or the limit of a link (m/s).
 
     What a search and a report have to know of an effect stands beside its equation, too:
 
@@ -100,6 +101,7 @@ class Effect:
     remembers: ClassVar[bool] = False
     rank: ClassVar[int] = 0
     adds: ClassVar[bool] = False
+    guided: ClassVar[Literal["", "stop", "limit"]] = ""
     draws: ClassVar[bool] = False
     hook: ClassVar[Hook]
     own: ClassVar[bool] = False

@@ -36,8 +36,8 @@ def _is_on(scene: Scene, lane: float) -> Tensor:
     return (scene.lane - lane).abs() < (0.5 if lane != EVERY_LANE else math.inf)
 
 
-def _before(room: Tensor, scene: Scene, driver: Driver) -> Tensor:
-    """Return the additional IDM deceleration for a standing obstacle ``room`` metres ahead of a driver (m/s², ≤ 0)."""
+def before_obstacle(room: Tensor, scene: Scene, driver: Driver) -> Tensor:
+    """Return the further IDM deceleration for a standing obstacle ``room`` metres ahead ``[..., n]`` (m/s², ≤ 0)."""
     leader = interaction(driver, scene.speed, scene.leader.gap, scene.leader.speed) * scene.leader.present
     more = torch.relu(interaction(driver, scene.speed, room, torch.zeros_like(room)) - leader)
     return torch.where(room < FAR, -driver.max_accel * more, 0.0)
@@ -120,7 +120,7 @@ class LaneClosure(Effect):
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the deceleration for a standing obstacle where the lane is closed (m/s²)."""
-        return _before(self._room(scene, FAR), scene, driver)
+        return before_obstacle(self._room(scene, FAR), scene, driver)
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class Signal(Effect):
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the deceleration for a standing obstacle at the line while it is red (m/s²)."""
-        return _before(torch.where(self._stops(scene, p), p["place"] - scene.position, FAR), scene, driver)
+        return before_obstacle(torch.where(self._stops(scene, p), p["place"] - scene.position, FAR), scene, driver)
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return 0: nobody has begun to stop."""

@@ -9,10 +9,10 @@ import torch
 from idm_env.effects import IDM
 from idm_env.jobs.storage import refuse_unwritable, write_text
 from idm_env.model_file import Model
+from idm_env.roads.sumo_demand import PARAMETERS
 
 _MARK = "<!-- Written by idm-env fit. -->"
-ATTRIBUTES = {"accel": "max_accel", "decel": "comfort_decel", "tau": "time_gap", "minGap": "min_gap"}
-ATTRIBUTES |= {"maxSpeed": "desired_speed", "delta": "exponent"}
+ATTRIBUTES = {**PARAMETERS, "delta": "exponent"}
 """SUMO's attribute → IDM's parameter: m/s², m/s², s, m, m/s, none."""
 
 

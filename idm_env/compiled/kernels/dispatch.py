@@ -31,7 +31,10 @@ def found(simulator: CarFollowingStep, state: State, inputs: Inputs, params: Par
     if why is not None:
         return why
     if state.lanes is not None:
-        from idm_env.compiled.kernels.several import kernel_of
+        if state.lanes.journeys is not None:
+            from idm_env.compiled.kernels.networks import kernel_of
+        else:
+            from idm_env.compiled.kernels.several import kernel_of
 
         return kernel_of(simulator, state, inputs)  # type: ignore[arg-type]
     from idm_env.compiled.kernels.printed import tile_kernel
@@ -62,9 +65,10 @@ def rollout(
     if isinstance(kernel, str):
         return None
     if state.lanes is not None:
-        from idm_env.compiled.kernels import several
+        from idm_env.compiled.kernels import networks, several
 
-        return several.rollout(kernel, simulator, state, inputs, params, steps, keep)
+        way = several if state.lanes.journeys is None else networks
+        return way.rollout(kernel, simulator, state, inputs, params, steps, keep)
     from idm_env.compiled.kernels import lanes
 
     block = min(every or lanes.BLOCK, 4 * lanes.BLOCK)

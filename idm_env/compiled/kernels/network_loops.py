@@ -1,0 +1,433 @@
+"""Compiled events of a network: order on links, entries, leaders, and gates.
+
+One event of one row of ``n`` slots, in place. What is decided is discrete; what that makes of positions, speeds and
+gaps are a few lines here, the same as in ``multilane.junctions``, where they are differentiable.
+
+What belongs to vehicles stands in ``car`` (numbers) and ``tag`` (whole numbers), to links in ``road`` and ``site``, to
+moves in ``move``: a row each, a column for each name below. ``against`` are foes and yields ``(2, M, F)``,
+``rules`` b_m (m/s²), t_c (s), sight and reach (m), the time to the next event (s), 1 / 2b_m, and how far one may come
+until then beyond v²/2b_m and at a constant speed (m); ``driver`` are T, s0 and b of all, or of each.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+from __future__ import annotations
+
+import numpy as np
+
+from idm_env.compiled.kernels.tiles import exact
+
+CAR: tuple[str, ...] = ("position", "speed", "accel", "gap", "length", "present", "asks", "stop", "limit")
+CAR += ("base", "moved", "entering", "line", "later")
+"""Of vehicles, numbers: state, and behind it the way to the leader's link, how far the own link is ahead of the one
+before, the speed to enter at, where the next line is, closed or not, and the limit of the next link."""
+TAG: tuple[str, ...] = ("link", "leader", "follower", "route", "hop", "told", "reserved", "due", "entered", "left")
+TAG += ("new", "gate", "here", "order", "waits")
+"""Of vehicles, whole numbers: state, and behind it what is new, the next move, the slots that are here, in any
+order and in that of links, and for whom a vehicle waits at its gate (−1: for no vehicle)."""
+POSITION, SPEED, ACCEL, GAP, LENGTH, PRESENT, ASKS, STOP, LIMIT, BASE, MOVED, ENTERING, LINE, LATER = range(len(CAR))
+LINK, LEADER, FOLLOWER, ROUTE, HOP, TOLD, RESERVED, DUE, ENTERED, LEFT, NEW, GATE, HERE, ORDER, WAITS = range(len(TAG))
+LONG, FAST, TRAIL_BASE, HEADING = range(4)
+"""Of links, numbers: length and limit, the way to the link of the vehicle whose rear is there, and how much is on its
+way there through a junction (m)."""
+OPENS, MOVE_OF, BEFORE, COUNT, BEGIN, TAIL, TRAIL, QUEUE = range(8)
+"""Of links, whole numbers: the move that begins with it, or that it is a part of; whether a gate is at its end; how
+many are there, where they begin in the order, who is the last, whose rear is there, and whether somebody waits."""
+START, END, SIGNAL, INDEX, SHOWN, INSIDE, COMING, HOLDER = range(8)
+"""Of moves, whole numbers: their links, signal and index, what it shows, how many are inside or have reserved, one who
+arrives within t_c (his slot and 1, 0 for nobody), and one of those inside."""
+SLOTS, LINKS, MOVES, WIDE, AGAINST, EACH = range(6)
+MOST_DECEL, CRITICAL_GAP, SIGHT, REACH, EVERY, BRAKING, MORE = range(7)
+TIME_GAP, LEAST, BRAKE = range(3)
+
+W, K = 16, 8
+"""Columns of vehicles, and of links and moves: what one needs is on two lines of a cache. Tables are handed on as
+pointers: numba counts references to arrays at every call, which costs more than most of what is done here."""
+NONE = -1
+RED, GREEN, AMBER, YIELD = range(4)
+FAR, OPEN = 1e4, 1e6
+STANDS = 1.0
+"""Speed below which whoever is behind a junction may not make room in time (m/s)."""
+SAME, LED, CAME, CAME_BEHIND = range(4)
+"""What is new of a vehicle: nothing, its leader, itself, itself at its leader's speed."""
+
+
+@exact
+def event(step, dt, anew, sizes, tables, plans, phases):
+    """Do one event; return how many vehicles there are. ``anew``: gates ahead are not known from the event before."""
+    car, tag, road, site, move, against, routes, rules, driver = tables
+    show(step * dt, sizes[MOVES], move, plans, phases)
+    n = travel(step, anew, sizes, car, tag, road, site, move, routes)
+    n = enter(step, n, sizes, car, tag, road, site, move, routes, rules, driver)
+    sort(n, sizes[LINKS], car, tag, site)
+    follow(n, sizes, car, tag, road, site, routes, rules)
+    guard(n, sizes, car, tag, road, site, move, against, routes, rules, driver)
+    return n
+
+
+@exact
+def show(time, moves, move, plans, phases):
+    """Find the aspect of every move, by plans or by the phases that are set."""
+    shows, first, until, offset, now = plans
+    for s in range(len(offset)):
+        begin, end = first[s], first[s + 1]
+        p = begin + phases[s]
+        if phases[s] < 0:
+            t, p = (time - offset[s] + 1e-6) % until[end - 1], begin
+            while p < end - 1 and t >= until[p]:
+                p += 1
+        now[s] = p
+    for m in range(moves):
+        s = move[K * m + SIGNAL]
+        move[K * m + SHOWN] = YIELD if s < 0 else shows[now[s], move[K * m + INDEX]]
+
+
+@exact
+def next_link(i, h, wide, tag, routes):
+    """Return link ``h`` of a vehicle's route, −1 behind its end."""
+    return routes[tag[W * i + ROUTE] * wide + h] if h < wide else NONE
+
+
+@exact
+def put_on_link(i, wide, car, tag, road, site, move, routes):
+    """Note whose last vehicle is on a link, whose rear is still on links behind, and which moves have somebody."""
+    k, x = tag[W * i + LINK], car[W * i + POSITION]
+    site[K * k + COUNT] += 1
+    if site[K * k + TAIL] < 0 or x < car[W * site[K * k + TAIL] + POSITION]:
+        site[K * k + TAIL] = i
+    m = site[K * k + MOVE_OF]
+    if m >= 0:
+        move[K * m + INSIDE] += 1
+        move[K * m + HOLDER] = i
+        road[K * move[K * m + END] + HEADING] += car[W * i + LENGTH]
+    rear, back, h = x - car[W * i + LENGTH], x - x, tag[W * i + HOP] - 1
+    while h >= 0 and rear + back < 0:
+        k = routes[tag[W * i + ROUTE] * wide + h]
+        back += road[K * k + LONG]
+        j = site[K * k + TRAIL]
+        if j < 0 or back + rear < road[K * k + TRAIL_BASE] + car[W * j + POSITION] - car[W * j + LENGTH]:
+            site[K * k + TRAIL], road[K * k + TRAIL_BASE] = i, back
+        if site[K * k + MOVE_OF] >= 0:
+            move[K * site[K * k + MOVE_OF] + INSIDE] += 1
+            move[K * site[K * k + MOVE_OF] + HOLDER] = i
+        h -= 1
+
+
+@exact
+def travel(step, anew, sizes, car, tag, road, site, move, routes):
+    """Move everybody to the next link who is beyond the end of his; return how many have not left."""
+    for k in range(sizes[LINKS]):
+        site[K * k + TAIL], site[K * k + TRAIL], site[K * k + COUNT], site[K * k + QUEUE] = NONE, NONE, 0, 0
+        road[K * k + HEADING] = 0
+    for m in range(sizes[MOVES]):
+        move[K * m + INSIDE], move[K * m + COMING] = 0, 0
+    n = 0
+    for i in range(sizes[SLOTS]):
+        if tag[W * i + DUE] > step:
+            break
+        if car[W * i + PRESENT] <= 0:
+            continue
+        k, h, far, x = (
+            tag[W * i + LINK],
+            tag[W * i + HOP],
+            road[LONG] - road[LONG],
+            car[W * i + POSITION],
+        )
+        while x - far >= road[K * k + LONG]:
+            h += 1
+            far += road[K * k + LONG]
+            k = next_link(i, h, sizes[WIDE], tag, routes)
+            if k < 0:
+                break
+            if site[K * k + OPENS] >= 0:
+                tag[W * i + TOLD], tag[W * i + RESERVED] = 0, 0
+        car[W * i + MOVED], tag[W * i + NEW] = 0, SAME
+        if k < 0:
+            tag[W * i + LEFT], tag[W * i + LEADER], tag[W * i + FOLLOWER] = step, i, i
+            car[W * i + PRESENT], car[W * i + SPEED], car[W * i + ACCEL], car[W * i + GAP] = 0, 0, 0, FAR
+            continue
+        if far > 0:
+            car[W * i + MOVED], car[W * i + POSITION], tag[W * i + HOP], tag[W * i + LINK] = far, x - far, h, k
+        tag[W * n + HERE] = i
+        n += 1
+        put_on_link(i, sizes[WIDE], car, tag, road, site, move, routes)
+        if far > 0 or anew:
+            find_gate(i, sizes[WIDE], car, tag, road, site, routes)
+        if tag[W * i + RESERVED]:
+            reserve(i, tag[W * i + GATE], 1, car, tag, road, move)
+    return n
+
+
+@exact
+def leader_ahead(i, reach, wide, car, tag, road, site, routes):
+    """Return whom the first vehicle of a link follows, and the way from the beginning of his link to his leader's.
+
+    That is the next one along his route, or one whose rear is not yet on a way of his own. −1 for nobody.
+    """
+    way, h, k = road[LONG] - road[LONG], tag[W * i + HOP], tag[W * i + LINK]
+    while k >= 0 and way - car[W * i + POSITION] < reach:
+        j = site[K * k + TAIL] if h > tag[W * i + HOP] else NONE
+        base = way
+        if j < 0:
+            j, base = site[K * k + TRAIL], way + road[K * k + TRAIL_BASE]
+        if j == i:
+            break
+        if j >= 0:
+            return j, base
+        way += road[K * k + LONG]
+        h += 1
+        k = next_link(i, h, wide, tag, routes)
+    return NONE, way
+
+
+@exact
+def find_gate(i, wide, car, tag, road, site, routes):
+    """Find a vehicle's next move, −1 for none, and the way to its line from the beginning of his link; and a limit."""
+    way, h = road[K * tag[W * i + LINK] + LONG], tag[W * i + HOP] + 1
+    k = next_link(i, h, wide, tag, routes)
+    car[W * i + LATER], tag[W * i + GATE] = road[K * (max(k, 0)) + FAST] if k >= 0 else FAR, NONE
+    while k >= 0:
+        if site[K * k + OPENS] >= 0:
+            tag[W * i + GATE] = site[K * k + OPENS]
+            break
+        way += road[K * k + LONG]
+        h += 1
+        k = next_link(i, h, wide, tag, routes)
+    car[W * i + LINE] = way
+
+
+@exact
+def enter(step, n, sizes, car, tag, road, site, move, routes, rules, driver):
+    """Let the first of each queue in where there is room, and nobody on his way there; return how many are there.
+
+    ::
+
+        s ≥ s0 + v T    and    (v² − v_l²) / 2b ≤ s − s0    and    v² ≤ 2 b_m s_line
+
+    with the speed that he asks for, or that of the vehicle ahead if it must be and is less.
+    """
+    for i in range(sizes[SLOTS]):
+        if tag[W * i + DUE] > step:
+            break
+        k = tag[W * i + LINK]
+        if tag[W * i + ENTERED] >= 0 or site[K * k + QUEUE]:
+            continue
+        site[K * k + QUEUE] = 1
+        if road[K * k + HEADING] > 0:
+            continue
+        car[W * i + POSITION] = 0
+        j, base = leader_ahead(i, rules[REACH], sizes[WIDE], car, tag, road, site, routes)
+        if site[K * k + TAIL] >= 0:
+            j, base = site[K * k + TAIL], base - base
+        find_gate(i, sizes[WIDE], car, tag, road, site, routes)
+        v = min(car[W * i + ASKS], road[K * k + FAST])
+        car[W * i + ENTERING] = (
+            min(v, np.sqrt(2 * rules[MOST_DECEL] * car[W * i + LINE])) if tag[W * i + GATE] >= 0 else v
+        )
+        kind = entry(i, j, base, sizes[EACH], car, driver)
+        if kind == SAME:
+            continue
+        car[W * i + SPEED] = (
+            min(car[W * i + ENTERING], car[W * j + SPEED]) if kind == CAME_BEHIND else car[W * i + ENTERING]
+        )
+        car[W * i + ACCEL], car[W * i + PRESENT], tag[W * i + ENTERED], tag[W * i + LEADER] = 0, 1, step, i
+        tag[W * i + TOLD], tag[W * i + RESERVED], car[W * i + MOVED], tag[W * i + NEW] = 0, 0, 0, kind
+        tag[W * n + HERE] = i
+        n += 1
+        put_on_link(i, sizes[WIDE], car, tag, road, site, move, routes)
+    return n
+
+
+@exact
+def entry(i, j, base, each, car, driver):
+    """Return how a vehicle enters behind vehicle ``j`` (−1: nobody), ``SAME`` for not at all."""
+    if j < 0:
+        return CAME
+    d = i if each > 1 else 0
+    v, v_l = car[W * i + ENTERING], car[W * j + SPEED]
+    room = base + car[W * j + POSITION] - car[W * j + LENGTH] - driver[LEAST * each + d]
+    if room >= v * driver[TIME_GAP * each + d] and v * v - v_l * v_l <= 2 * driver[BRAKE * each + d] * room:
+        return CAME
+    return CAME_BEHIND if room >= min(v, v_l) * driver[TIME_GAP * each + d] else SAME
+
+
+@exact
+def sort(n, links, car, tag, site):
+    """Put those who are here in the order of their links, front first; those of link ``k`` begin at ``begin[k]``."""
+    p = 0
+    for k in range(links):
+        site[K * k + BEGIN] = p
+        p += site[K * k + COUNT]
+        site[K * k + COUNT] = 0
+    site[K * links + BEGIN] = p
+    for q in range(n):
+        i = tag[W * q + HERE]
+        k = tag[W * i + LINK]
+        p = site[K * k + BEGIN] + site[K * k + COUNT]
+        site[K * k + COUNT] += 1
+        while p > site[K * k + BEGIN] and car[W * tag[W * p - W + ORDER] + POSITION] < car[W * i + POSITION]:
+            tag[W * p + ORDER] = tag[W * p - W + ORDER]
+            p -= 1
+        tag[W * p + ORDER] = i
+
+
+@exact
+def follow(n, sizes, car, tag, road, site, routes, rules):
+    """Find whom everybody follows; where that is another one the gap is measured anew, else it is what it was."""
+    for q in range(n):
+        tag[W * tag[W * q + ORDER] + FOLLOWER] = tag[W * q + ORDER]
+    for q in range(n):
+        i = tag[W * q + ORDER]
+        if q > site[K * tag[W * i + LINK] + BEGIN]:
+            j, base = tag[W * q - W + ORDER], road[LONG] - road[LONG]
+            tag[W * j + FOLLOWER] = i
+        else:
+            reach = max(rules[REACH], car[W * i + SPEED] * car[W * i + SPEED] * rules[BRAKING])
+            j, base = leader_ahead(i, reach, sizes[WIDE], car, tag, road, site, routes)
+        car[W * i + BASE] = base
+        if j < 0:
+            tag[W * i + LEADER], car[W * i + GAP] = i, FAR
+        elif j != tag[W * i + LEADER] or tag[W * i + NEW] > SAME:
+            tag[W * i + LEADER], tag[W * i + NEW] = j, max(tag[W * i + NEW], LED)
+            car[W * i + GAP] = car[W * i + BASE] + car[W * j + POSITION] - car[W * j + LENGTH] - car[W * i + POSITION]
+    for q in range(n):  # of several who merge behind one, the first is his follower, unless there is one on his link
+        i = tag[W * q + ORDER]
+        if q == site[K * tag[W * i + LINK] + BEGIN] and tag[W * tag[W * i + LEADER] + FOLLOWER] == tag[W * i + LEADER]:
+            tag[W * tag[W * i + LEADER] + FOLLOWER] = i
+
+
+@exact
+def guard(n, sizes, car, tag, road, site, move, against, routes, rules, driver):
+    """Open gates, front first and in the order of links; whoever finds his shut is told to stop at its line."""
+    for q in range(n):
+        look_ahead(tag[W * q + ORDER], sizes, car, tag, road, site, move, routes, rules, driver)
+    for turn in range(2):  # those on links before gates, then those who are further behind
+        for k in range(sizes[LINKS]):
+            if site[K * k + BEFORE] == turn:
+                continue
+            for q in range(site[K * k + BEGIN], site[K * (k + 1) + BEGIN]):
+                i = tag[W * q + ORDER]
+                m = tag[W * i + GATE]
+                if m < 0 or tag[W * i + RESERVED]:
+                    continue
+                if turn == 1 and q == site[K * k + BEGIN] and waits_behind(i, m, car, tag):
+                    break
+                if not passes(i, m, sizes, car, tag, road, site, move, against, routes, rules, driver):
+                    break
+
+
+@exact
+def look_ahead(i, sizes, car, tag, road, site, move, routes, rules, driver):
+    """Note whether a vehicle is about to arrive; what he has reserved ends where it is closed and he can stop.
+
+    Nobody arrives behind somebody who stands before the line, or who stands because he cannot leave the junction.
+    Before a link of a lower limit he brakes as before a closed line, until he is as slow.
+    """
+    v, k, m, room = car[W * i + SPEED], tag[W * i + LINK], tag[W * i + GATE], car[W * i + LINE] - car[W * i + POSITION]
+    tag[W * i + WAITS] = NONE
+    car[W * i + LIMIT], car[W * i + STOP] = road[K * k + FAST], road[K * k + LONG] if car[W * i + LATER] < v else OPEN
+    if m < 0:
+        return
+    j = tag[W * i + LEADER]
+    stuck = j != i and car[W * j + SPEED] < STANDS and car[W * i + BASE] + car[W * j + POSITION] < car[W * i + LINE]
+    near = room < rules[CRITICAL_GAP] * max(v, STANDS) and not stuck
+    if near and (v >= STANDS or has_room(i, m, sizes, car, tag, road, site, move, routes, driver)):
+        move[K * m + COMING] = i + 1
+    if (
+        tag[W * i + RESERVED]
+        and (move[K * m + SHOWN] == RED or move[K * m + SHOWN] == AMBER)
+        and v * v * rules[BRAKING] <= room
+    ):
+        tag[W * i + TOLD] = 1
+        reserve(i, m, -1, car, tag, road, move)
+
+
+@exact
+def reserve(i, m, sign, car, tag, road, move):
+    """Reserve a move for a vehicle (1), or end that (−1)."""
+    tag[W * i + RESERVED] = sign > 0
+    move[K * m + INSIDE] += sign
+    move[K * m + HOLDER] = i
+    road[K * move[K * m + END] + HEADING] += sign * car[W * i + LENGTH]
+
+
+@exact
+def waits_behind(i, m, car, tag):
+    """Whether somebody is between a vehicle and his line who does not pass it."""
+    j = tag[W * i + LEADER]
+    before_line = j != i and car[W * i + BASE] + car[W * j + POSITION] < car[W * i + LINE]
+    return before_line and not (tag[W * j + RESERVED] and tag[W * j + GATE] == m)
+
+
+@exact
+def passes(i, m, sizes, car, tag, road, site, move, against, routes, rules, driver):
+    """Tell a vehicle to stop at his line, or let him drive on and reserve when he is near; return whether he has."""
+    room, v, every = car[W * i + LINE] - car[W * i + POSITION], car[W * i + SPEED], rules[EVERY]
+    if room >= max(rules[REACH], v * v * rules[BRAKING]):
+        return False
+    if is_shut(i, m, room, sizes, car, tag, road, site, move, against, routes, rules, driver):
+        car[W * i + STOP], tag[W * i + TOLD] = car[W * i + LINE], 1
+        return False
+    tag[W * i + TOLD] = 0
+    if room > v * v * rules[BRAKING] + v * every + rules[MORE]:  # how far he may come until the next event
+        return False
+    reserve(i, m, 1, car, tag, road, move)
+    return True
+
+
+@exact
+def is_shut(i, m, room, sizes, car, tag, road, site, move, against, routes, rules, driver):
+    """Whether a gate is shut to a vehicle that is ``room`` (m) before its line.
+
+    Who yields comes as near as he can stop within sight of the line, and if he has waited there passes in amber.
+    """
+    square, yields = car[W * i + SPEED] * car[W * i + SPEED], against[(sizes[MOVES] + m) * sizes[AGAINST]] >= 0
+    can_stop = tag[W * i + TOLD] == 1 or square * rules[BRAKING] <= room
+    waits = yields and tag[W * i + TOLD] == 1 and room < rules[SIGHT]
+    if can_stop and (move[K * m + SHOWN] == RED or (move[K * m + SHOWN] == AMBER and not waits)):
+        return True
+    for q in range(sizes[AGAINST]):
+        f = against[m * sizes[AGAINST] + q]
+        if f >= 0 and move[K * f + INSIDE] > 0:
+            tag[W * i + WAITS] = move[K * f + HOLDER]
+            return True
+    if move[K * m + SHOWN] != GREEN and yields:
+        brake = driver[BRAKE * sizes[EACH] + (i if sizes[EACH] > 1 else 0)]
+        if room > rules[SIGHT] and can_stop and square > 2 * brake * rules[SIGHT]:
+            return True
+        for q in range(sizes[AGAINST]):
+            f = against[(sizes[MOVES] + m) * sizes[AGAINST] + q]
+            if f >= 0 and move[K * f + SHOWN] != RED and move[K * f + SHOWN] != AMBER and move[K * f + COMING] > 0:
+                tag[W * i + WAITS] = move[K * f + COMING] - 1
+                return True
+    return (
+        can_stop
+        and against[m * sizes[AGAINST]] >= 0
+        and not has_room(i, m, sizes, car, tag, road, site, move, routes, driver)
+    )
+
+
+@exact
+def has_room(i, m, sizes, car, tag, road, site, move, routes, driver):
+    """Whether a vehicle can leave a junction, even if all ahead stop behind the last who stands, or at a link's end."""
+    h, k = tag[W * i + HOP] + 1, move[K * m + END]
+    while next_link(i, h, sizes[WIDE], tag, routes) != k:
+        h += 1
+    way, least = road[LONG] - road[LONG], driver[LEAST * sizes[EACH] + (i if sizes[EACH] > 1 else 0)]
+    needs = car[W * i + LENGTH] + road[K * k + HEADING] + least
+    while k >= 0:
+        for q in range(site[K * (k + 1) + BEGIN] - 1, site[K * k + BEGIN] - 1, -1):
+            j = tag[W * q + ORDER]
+            if j == i or car[W * j + SPEED] < STANDS:
+                tag[W * i + WAITS] = j
+                return j == i or way + car[W * j + POSITION] - car[W * j + LENGTH] >= needs
+            needs += car[W * j + LENGTH] + least
+        j = site[K * k + TRAIL]
+        if j >= 0 and car[W * j + SPEED] < STANDS:
+            tag[W * i + WAITS] = j
+            return way + road[K * k + TRAIL_BASE] + car[W * j + POSITION] - car[W * j + LENGTH] >= needs
+        way += road[K * k + LONG]
+        if way >= needs:
+            return True
+        h += 1
+        k = next_link(i, h, sizes[WIDE], tag, routes)
+    return True

@@ -1,0 +1,103 @@
+"""Demand of a network: vehicles with departures, routes and kinds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from idm_env.roads.network import Array, Network
+from idm_env.roads.sumo_demand import read_demand
+from idm_env.roads.ways import draw_turns
+from idm_env.validation import shown
+
+
+@dataclass(frozen=True, eq=False)
+class Demand:
+    """A vehicle in each of n rows, in the order of departure (rows are sorted), and R routes between them.
+
+    ``routes`` (R, H) are lists of links, those inside junctions included, filled with −1. A vehicle follows ``route``
+    (n), is due at ``depart`` (n, s) at the beginning of its first link, asks there for ``speed`` (n, m/s), has
+    ``length`` (n, m) and is of a ``kind`` (n): a row of ``kinds``, which map ``effect.parameter`` to a value.
+
+    ValueError, in one line, for numbers that no vehicle has.
+    """
+
+    routes: Array
+    route: Array
+    depart: Array
+    speed: Array = field(default_factory=lambda: np.array(1e3))
+    length: Array = field(default_factory=lambda: np.array(5.0))
+    kind: Array = field(default_factory=lambda: np.array(0))
+    kinds: tuple[Mapping[str, float], ...] = ({},)
+    skipped: Mapping[str, int] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        routes, n = np.atleast_2d(np.asarray(self.routes, np.int32)), np.size(self.route)
+        whole = {"route": len(routes), "kind": len(self.kinds)}
+        columns: dict[str, Array] = {}
+        for name in ("route", "depart", "speed", "length", "kind"):
+            x = np.asarray(getattr(self, name), np.int32 if name in whole else float)
+            columns[name] = np.broadcast_to(x.reshape(-1) if x.ndim else x, (n,))
+        order = np.argsort(columns["depart"], kind="stable")
+        object.__setattr__(self, "routes", routes)
+        for name, x in columns.items():
+            object.__setattr__(self, name, x[order])
+        for name, count in whole.items():
+            for i in np.flatnonzero((columns[name] < 0) | (columns[name] >= count)):
+                raise ValueError(f"vehicle {i}: {name} = {columns[name][i]} does not exist; there are {count}.")
+        for name, low, high in (("depart", 0.0, np.inf), ("speed", 0.0, 1e3), ("length", 0.1, 100.0)):
+            for i in np.flatnonzero(~((columns[name] >= low) & (columns[name] <= high))):
+                raise ValueError(
+                    f"vehicle {i}: {name} = {columns[name][i]:g} must be at least {low:g}, at most {high:g}."
+                )
+
+    @classmethod
+    def from_sumo(cls, network: Network, *paths: str | Path, seed: int = 0, end: float = 3600.0) -> Demand:
+        """Return the demand of SUMO's files of routes and types: vehicles, trips by the quickest way, and flows.
+
+        Flows without an end last until ``end`` (s); ``skipped`` counts what was left out or changed. ValueError, in one
+        line that names the element, for a file that cannot be used.
+        """
+        return cls(**read_demand(network, [Path(path) for path in paths], seed, end))._checked(network)
+
+    @classmethod
+    def by_turns(
+        cls,
+        network: Network,
+        per_hour: float | Mapping[str, float],
+        seconds: float,
+        *,
+        seed: int = 0,
+        shares: Sequence[float] = (0.2, 0.6, 0.2),
+    ) -> Demand:
+        """Return Poisson arrivals at every edge to which none leads, which turn left, go on or turn right by shares.
+
+        ``per_hour`` is one rate for all, or one by edge (1/h); a journey ends where no edge follows. The same seed
+        gives the same demand. ValueError for a rate, a share or an edge that cannot be.
+        """
+        return cls(**draw_turns(network, per_hour, seconds, seed, shares))._checked(network)
+
+    def _checked(self, network: Network) -> Demand:
+        self.check(network)
+        return self
+
+    def check(self, network: Network) -> None:
+        """Raise ValueError, in one line, for a route that does not connect, or a move in use that is never green."""
+        links = len(network.names)
+        pairs = network.follows[:, 0] * links + network.follows[:, 1]
+        for r in np.unique(self.route):
+            way = self.routes[r][self.routes[r] >= 0].astype(np.int64)
+            if not len(way) or way.max() >= links or (self.routes[r][: len(way)] < 0).any():
+                raise ValueError(f"route {r}: {shown(self.routes[r].tolist())} must be links from 0 to {links - 1}.")
+            for i in np.flatnonzero(~np.isin(way[:-1] * links + way[1:], pairs)):
+                a, b = (network.names[way[j]] for j in (i, i + 1))
+                raise ValueError(f"route {r}: link '{b}' does not follow '{a}'.")
+            if network.inner[way[0]] or network.inner[way[-1]]:
+                raise ValueError(f"route {r}: must begin and end outside junctions.")
+            for m in np.unique(network.move_of[way[network.inner[way]]]):
+                if not network.ever_open(int(m)):
+                    signal = network.plans[network.signal[m]].name
+                    raise ValueError(f"route {r}: signal '{signal}' never shows green to move {network.move_name(m)}.")

@@ -1,0 +1,219 @@
+"""SUMO's demand (``.rou.xml``): vehicles, trips by the quickest way and flows, as columns of ``Demand``.
+
+All that is random (departures of a flow, types and routes of a distribution) is drawn here, by a counter under the key
+of the seed and the element's id. Times in s, speeds in m/s, lengths in m. Source: SUMO's documentation, *Definition of
+Vehicles, Vehicle Types, and Routes*.
+"""
+
+import math
+import re
+from bisect import bisect
+from collections import Counter
+from collections.abc import Sequence
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from idm_env import validation
+from idm_env.roads import sumo_files
+from idm_env.roads.network import Network, padded
+from idm_env.roads.sumo_files import name, number, seconds, text
+from idm_env.roads.ways import Route, Ways, arrivals, keyed
+
+PARAMETERS = {"accel": "max_accel", "decel": "comfort_decel", "tau": "time_gap", "minGap": "min_gap"}
+PARAMETERS |= {"maxSpeed": "desired_speed"}
+"""SUMO's attribute → IDM's parameter: m/s², m/s², s, m, m/s."""
+MOST_VEHICLES = 5_000_000
+CAR = (5.0, 2.6, 4.5, 55.56)
+CLASSES = dict.fromkeys(("private", "vip", "hov", "evehicle", "custom1", "custom2", "authority", "army", "taxi"), CAR)
+CLASSES |= {"passenger": CAR, "emergency": (6.5, *CAR[1:]), "delivery": (6.5, *CAR[1:])}
+CLASSES |= {"truck": (7.1, 1.3, 4.0, 36.11), "trailer": (16.5, 1.1, 4.0, 36.11), "bus": (12.0, 1.2, 4.0, 27.78)}
+CLASSES |= {"coach": (14.0, 2.0, 4.0, 27.78), "motorcycle": (2.2, 6.0, 10.0, 55.56), "moped": (2.1, 1.1, 7.0, 16.67)}
+"""Length, accel, decel and maxSpeed of SUMO 1.28 where a vType gives none; other classes are no cars."""
+READ = {
+    "vType": {"id", "vClass", "carFollowModel", "length", "probability", "color", "guiShape", "speedDev", *PARAMETERS}
+}
+READ["vehicle"] = {"id", "type", "depart", "departSpeed", "route", "color"}
+READ["trip"] = READ["vehicle"] | {"from", "to", "via"}
+READ["flow"] = READ["trip"] | {"begin", "end", "number", "vehsPerHour", "perHour", "period", "probability"}
+"""Attributes that are read, or that change nothing; all others are counted."""
+
+
+def read_demand(network: Network, paths: Sequence[Path], seed: int, end: float) -> dict[str, Any]:
+    """Return the columns of the demand of files of routes and types; ``end`` (s) is that of flows without one.
+
+    ValueError, in one line that names the element, for one that cannot be used.
+    """
+    reader = _Reader(network, seed, end)
+    for path in paths:
+        for element in sumo_files.elements(path, ("routes", "additional")):
+            reader.add(element)
+    return reader.columns()
+
+
+class _Reader:
+    """Types, routes and vehicles of all files, in the order in which they stand."""
+
+    def __init__(self, network: Network, seed: int, end: float) -> None:
+        self.ways, self.limit, self.seed, self.end = Ways(network), network.limit.tolist(), seed, end
+        self.skipped: Counter[str] = Counter()
+        self.kinds: list[dict[str, float]] = []
+        self.known: dict[str, dict[str, list[tuple[float, Any]]]] = {"vType": {}, "route": {}}
+        self.numbers: dict[Route, int] = {}
+        self.rows: list[tuple[int, float, float, float, int]] = []
+
+    def add(self, element: Element) -> None:
+        """Take one element; what is neither traffic of cars nor said of it is counted."""
+        kind = element.tag.removesuffix("Distribution")
+        if kind in self.known:
+            text(element, "id")
+            self._choices(element, kind)
+        elif kind in ("vehicle", "trip", "flow"):
+            self._add_vehicles(element)
+        else:
+            self.skipped[f"elements <{kind}>"] += 1
+
+    def _choices(self, element: Element, kind: str, owner: str = "") -> list[tuple[float, Any]]:
+        """Return the types or routes that an element stands for, each with its weight, and keep them by its id."""
+        if element.tag == kind:
+            make = self._type_of if kind == "vType" else self._route_of
+            pairs = [(number(element, "probability", 1.0, 0.0), make(element, owner or name(element)))]
+        else:
+            keys = element.get(f"{kind}s", "").split()
+            weights = element.get("probabilities", "1 " * len(keys)).split()
+            if len(keys) != len(weights):
+                raise ValueError(
+                    f"{name(element)} has {len(keys)} names and {len(weights)} probabilities. Give one each."
+                )
+            pairs = [(float(w), self._named(kind, key, element)[0][1]) for key, w in zip(keys, weights, strict=True)]
+            pairs += [pair for each in element.iter(kind) for pair in self._choices(each, kind, owner)]
+        if not sum(weight for weight, _ in pairs) > 0.0:
+            raise ValueError(f"{name(element)} has nothing of a probability above 0. Give it some.")
+        if "id" in element.attrib:
+            self.known[kind][element.attrib["id"]] = pairs
+        return pairs
+
+    def _named(self, kind: str, key: str, element: Element) -> list[tuple[float, Any]]:
+        """Return the types or routes of a name; ValueError where there are none."""
+        if key not in self.known[kind]:
+            raise ValueError(
+                f"{name(element)}: {kind} '{key[:60]}' is unknown.{validation.nearest(key, self.known[kind])}"
+            )
+        return self.known[kind][key]
+
+    def _route_of(self, element: Element, owner: str) -> Route:
+        if not (edges := text(element, "edges").split()):
+            raise ValueError(f"{owner} has a route without edges. Give it some.")
+        return self.ways.route_along(edges * int(number(element, "repeat", 1.0, 1.0)), owner)
+
+    def _type_of(self, element: Element, owner: str) -> tuple[int, float] | None:
+        """Return the row of ``kinds`` and the length (m) of a type, None of one that is no car's."""
+        self._count_unread(element)
+        vehicle_class, law = element.get("vClass", "passenger"), element.get("carFollowModel", "Krauss")
+        self.skipped[f"vTypes of {law} driven by IDM"] += law != "IDM"
+        self.skipped["vTypes with a spread of speed factors, driven without"] += number(element, "speedDev", 0.1) != 0.0
+        if vehicle_class not in CLASSES:
+            return None
+        length, *defaults = CLASSES[vehicle_class]
+        standard = dict(zip(("accel", "decel", "maxSpeed", "tau", "minGap"), (*defaults, 1.0, 2.5), strict=True))
+        kind = {f"idm.{PARAMETERS[key]}": number(element, key, standard[key], 0.0, above=True) for key in PARAMETERS}
+        self.kinds += [kind] if kind not in self.kinds else []
+        return self.kinds.index(kind), number(element, "length", length, 0.1)
+
+    def _count_unread(self, element: Element) -> None:
+        for key, _ in element.attrib.items() - {("speedFactor", "1"), ("departPos", "0"), ("departPos", "base")}:
+            if key in READ[element.tag]:
+                continue
+            self.skipped[f"attribute {key} of {element.tag}"] += 1
+
+    # -- vehicles ----------------------------------------------------------------------------------------------------
+
+    def _add_vehicles(self, element: Element) -> None:
+        """Add the rows of a vehicle, a trip or a flow."""
+        self._count_unread(element)
+        key = element.get("type", "DEFAULT_VEHTYPE")
+        if key == "DEFAULT_VEHTYPE" and key not in self.known["vType"]:
+            self._choices(Element("vType", id=key), "vType")
+        types, routes = self._named("vType", key, element), self._routes_of(element)
+        random = keyed(self.seed, text(element, "id"))
+        for depart in self._departures(element, random) if routes else ():
+            one, route = _choose(types, random), _choose(routes, random)
+            if one is None:
+                self.skipped[f"vehicles of type {key}, which is no car's"] += 1
+                continue
+            speed = self._entry_speed(element, self.kinds[one[0]]["idm.desired_speed"], self.limit[route[0]], random)
+            self.rows.append((self.numbers.setdefault(route, len(self.numbers)), depart, speed, one[1], one[0]))
+            if len(self.rows) > MOST_VEHICLES:
+                raise ValueError(f"{name(element)} brings more than {MOST_VEHICLES} vehicles. Give it fewer.")
+
+    def _routes_of(self, element: Element) -> list[tuple[float, Route]]:
+        """Return the routes of a vehicle, trip or flow with their weights; none between districts or junctions."""
+        own = [each for each in element if each.tag in ("route", "routeDistribution")]
+        for each in element:
+            self.skipped[f"elements <{each.tag}> of {element.tag}"] += each not in own
+        if own:
+            return self._choices(own[0], "route", name(element))
+        if "route" in element.attrib:
+            return self._named("route", element.attrib["route"], element)
+        if {"from", "to"} <= element.attrib.keys():
+            stops = [element.attrib["from"], *element.get("via", "").split(), element.attrib["to"]]
+            return [(1.0, self.ways.quickest(stops, name(element)))]
+        if not any(key.startswith(("from", "to")) for key in element.attrib):
+            raise ValueError(f"{name(element)} has no route. Give it a route, or from and to.")
+        self.skipped[f"{element.tag}s between districts or junctions"] += 1
+        return []
+
+    def _departures(self, element: Element, random: np.random.Generator) -> Sequence[float]:
+        """Return the departures of a vehicle, a trip or a flow (s)."""
+        if element.tag != "flow":
+            if element.get("depart") in ("triggered", "containerTriggered", "split", "now"):
+                self.skipped[f"vehicles that depart when {element.get('depart')}"] += 1
+                return []
+            return [0.0 if element.get("depart") == "begin" else seconds(element, "depart")]
+        begin, end = seconds(element, "begin", 0.0), seconds(element, "end", self.end)
+        most = number(element, "number", math.inf, 0.0)
+        hourly = next((key for key in ("vehsPerHour", "perHour") if key in element.attrib), None)
+        if match := re.fullmatch(r"exp\((.+)\)", element.get("period", "")):
+            element.set("period", match[1])
+        if hourly or "period" in element.attrib:
+            value = number(element, hourly or "period", None, 0.0, above=True)
+            period = 3600.0 / value if hourly else 1.0 / value if match else value
+        elif "probability" in element.attrib:
+            period = 1.0 / min(number(element, "probability", None, 0.0, above=True), 1.0)
+        elif most == math.inf:
+            raise ValueError(f"{name(element)} has neither a number nor a rate. Give it vehsPerHour.")
+        else:
+            period = (end - begin) / max(most, 1.0)
+        count = min(most, (end - begin) / period - 1e-9) if end > begin else 0.0
+        if count > MOST_VEHICLES:
+            raise ValueError(f"{name(element)} brings more than {MOST_VEHICLES} vehicles. Give it fewer.")
+        if match:
+            times = arrivals(1.0 / period, begin, end, random)
+        elif not hourly and "period" not in element.attrib and "probability" in element.attrib:
+            times = (begin + np.flatnonzero(random.random(math.ceil(end - begin)) * period < 1.0)).tolist()
+        else:
+            times = (begin + period * np.arange(math.ceil(count))).tolist()
+        return times[: int(min(most, MOST_VEHICLES))]
+
+    def _entry_speed(self, element: Element, most: float, limit: float, random: np.random.Generator) -> float:
+        """Return the speed at the entry (m/s), by its number or SUMO's word for it."""
+        word, fastest = element.get("departSpeed", "0"), min(most, limit)
+        if word == "random":
+            return fastest * random.random()
+        return fastest if word.isalpha() else min(number(element, "departSpeed", 0.0, 0.0), fastest)
+
+    def columns(self) -> dict[str, Any]:
+        """Return the columns of ``Demand``."""
+        columns = dict(zip(("route", "depart", "speed", "length", "kind"), zip(*self.rows, strict=True), strict=False))
+        if not columns:
+            raise ValueError("the files of demand have no vehicle. Give vehicles, trips or flows.")
+        return columns | {"routes": padded(list(self.numbers)), "kinds": tuple(self.kinds), "skipped": +self.skipped}
+
+
+def _choose(pairs: list[tuple[float, Any]], random: np.random.Generator) -> Any:
+    """Return one of several things by their weights."""
+    sums = list(accumulate(weight for weight, _ in pairs))
+    return pairs[bisect(sums, random.random() * sums[-1]) if len(pairs) > 1 else 0][1]
