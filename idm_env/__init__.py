@@ -43,12 +43,12 @@ def _register() -> None:
     """Register the environment ids; entry points are text, so that nothing heavy is imported here."""
     from gymnasium.envs.registration import register, registry
 
-    for name, keywords in {"DiffIDM-v0": {}, **{_task_id(task): {"task": task} for task in _TASKS}}.items():
+    for name, keywords in {"DiffIDM-v0": {}, **{_task_id(t): {"task": t} for t in (*_TASKS, "signals")}}.items():
         if name not in registry:
             register(
                 id=name,
-                entry_point="idm_env.envs.gym:DiffIDMEnv",
-                vector_entry_point="idm_env.envs.vector:DiffIDMVectorEnv",
+                entry_point="idm_env.envs.faces:single",
+                vector_entry_point="idm_env.envs.faces:vector",
                 kwargs=keywords,
                 # Each task has its own number of steps: the environment cuts episodes off, and its own spec says when.
                 # The checker's wrapper costs more than a step; tests run the full checker instead.

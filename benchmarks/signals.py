@@ -1,0 +1,174 @@
+"""Signals as agents: ``python -m benchmarks.signals [--inflow 300]``, rules beside PPO on a grid of 5 × 5.
+
+Delay is the time that vehicles lose, those who wait to enter included, per vehicle that was due (s), over 64 fresh
+episodes of 900 s; ± is 95 % of the paired difference to *max pressure 10*. Rows:
+
+* *fixed*: the plan of the network, 42 s green; *random* phases; *constant*, the first phase for ever;
+* *greedy*: the phase whose lanes hold most vehicles that stand;
+* *max pressure*: the phase with the most vehicles before it, less those behind (Varaiya 2013), a least green of 5, 10
+  or 15 s;
+* *searched*: vehicles, those that stand, those behind and a bonus for the present phase, weighed by four numbers that a
+  cross-entropy search finds on other episodes in ``--search-seconds`` of CPU time;
+* *PPO*: Stable-Baselines3's with ``VecNormalize``, one policy for all signals, several seeds, each its last policy.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import idm_env  # noqa: F401 (registers the environments)
+from benchmarks import command, table
+from benchmarks.bench.measure import machine
+from idm_env.envs.signal_faces import SignalsVectorEnv
+from idm_env.multilane.junctions import by_link
+
+EPISODES, FRESH, OTHERS = 64, 1 << 20, 1 << 19
+"""Episodes that judge, their first seed, and that of episodes on which a rule is searched."""
+PPO: dict[str, Any] = {"n_steps": 45, "batch_size": 2250, "gamma": 0.98, "ent_coef": 0.01}
+"""What PPO is given beside SB3's defaults; its learning rate falls from 6e-4."""
+Policy = Callable[[SignalsVectorEnv, np.ndarray], Any]
+
+
+def made(count: int, **keywords: Any) -> SignalsVectorEnv:
+    """Return that many worlds."""
+    return gymnasium.make_vec("DiffIDM-v0", count, task="signals", **keywords)  # type: ignore[return-value]
+
+
+def delays(env: SignalsVectorEnv, policy: Policy, seed: int) -> np.ndarray:
+    """Return the delay per vehicle of an episode in each world (s)."""
+    seen, _ = env.reset(seed=seed)
+    lost: Any = 0.0
+    for _ in range(env.task.horizon):
+        seen, _, _, _, info = env.step(policy(env, seen))
+        figures = info.get("final_info", info)
+        lost = lost + figures["lost"]
+    return lost / np.maximum(figures["inside"] + figures["waiting"] + figures["arrived"], 1)
+
+
+def served(env: SignalsVectorEnv) -> tuple[np.ndarray, np.ndarray]:
+    """Return which links lead to green, and from it, in each phase of each agent ``(S, P, L)``."""
+    task, net = env.task, env.task.road
+    shape = len(task.agents), int(task.counts.max()), len(net.names)
+    before, behind = np.zeros(shape), np.zeros(shape)
+    for k, s in enumerate(task.agents):
+        for p, state in enumerate(task.phases[s]):
+            moves = [m for m in np.flatnonzero(net.signal == s) if state[net.index[m]] in "Gg"]
+            before[k, p, net.start[moves]], behind[k, p, net.end[moves]] = 1.0, 1.0
+    return before, behind
+
+
+def weighed(weights: Any) -> Policy:
+    """Return the rule that takes the phase of the highest score.
+
+    Weights ``(4,)`` or one row for each world: of vehicles before, of those that stand, of those behind, of the present
+    phase.
+    """
+    weights = np.atleast_2d(weights)
+    masks: list[Any] = []
+
+    def choose(env: SignalsVectorEnv, seen: np.ndarray) -> np.ndarray:
+        if not masks:
+            masks.extend(served(env))
+        world = env.worlds.world
+        assert world is not None
+        on = by_link(env.task.road, world.state)
+        near, stand, behind = (
+            np.einsum("bl,spl->bsp", x.numpy(), mask)
+            for x, mask in ((on.vehicles, masks[0]), (on.halting, masks[0]), (on.vehicles, masks[1]))
+        )
+        present = np.eye(near.shape[2])[world.phase]
+        parts = np.stack((near, stand, -behind, present), -1)
+        scores = np.einsum("bspw,bw->bsp", parts, np.broadcast_to(weights, (len(near), 4)))
+        scores[:, np.arange(near.shape[2])[None] >= env.task.counts[:, None]] = -np.inf
+        return scores.argmax(-1)
+
+    return choose
+
+
+def searched(seconds: float, **keywords: Any) -> tuple[np.ndarray, float]:
+    """Return the weights of a cross-entropy search, which judges each by a world's delay, and its CPU time (s)."""
+    rows, keep, random, start = 48, 8, np.random.default_rng(0), time.process_time()
+    mean, width, env, turn = np.array([0.5, 0.5, 0.5, 1.0]), np.array([0.5, 0.5, 0.5, 2.0]), made(rows, **keywords), 0
+    while time.process_time() - start < seconds:
+        weights = mean + width * random.standard_normal((rows, 4))
+        # Two worlds of one seed would not differ: every candidate has an episode of its own.
+        best = weights[delays(env, weighed(weights), OTHERS + turn * rows).argsort()[:keep]]
+        mean, width, turn = best.mean(0), best.std(0) + 0.05, turn + 1
+    return mean, time.process_time() - start
+
+
+def trained(seed: int, steps: int, **keywords: Any) -> tuple[Policy, float]:
+    """Return PPO's last policy, one for all signals, and the CPU time of its training (s)."""
+    import stable_baselines3
+    import torch
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from idm_env.envs.sb3 import SB3VecEnv
+
+    torch.set_num_threads(1)
+    start = time.process_time()
+    scaled = VecNormalize(SB3VecEnv(made(8, shared=True, **keywords)), gamma=PPO["gamma"])
+    rate = {"learning_rate": lambda left: 6e-4 * left}
+    agent = stable_baselines3.PPO("MlpPolicy", scaled, seed=seed, device="cpu", **rate, **PPO)
+    agent.learn(steps)
+    scaled.training = False
+
+    def choose(env: SignalsVectorEnv, seen: np.ndarray) -> np.ndarray:
+        rows = scaled.normalize_obs(seen.reshape(-1, env.task.features))
+        return agent.predict(rows, deterministic=True)[0].reshape(len(seen), -1)
+
+    return choose, time.process_time() - start
+
+
+def signals(
+    inflow: float = 300.0, network: str = "grid 5x5", search_seconds: float = 30.0, steps: int = 1_000_000,
+    seeds: int = 5, episodes: int = EPISODES,
+) -> None:  # fmt: skip
+    """Delay per vehicle of rules and of PPO, on the same fresh episodes."""
+    keywords: dict[str, Any] = {"network": network, "inflow": inflow}
+    about, random = machine(), np.random.default_rng(0)
+    print(f"Delay per vehicle, {network}, {inflow:g} veh/h an entry ({about['processor']}, {about['date']})\n")
+    never: Policy = lambda env, seen: None  # noqa: E731
+    chance: Policy = lambda env, seen: random.integers(0, env.task.counts, (env.worlds.count, len(env.task.agents)))  # noqa: E731
+    first: Policy = lambda env, seen: np.zeros((env.worlds.count, len(env.task.agents)), int)  # noqa: E731
+    pressure = weighed([1.0, 0.0, 1.0, 0.0])
+    rows: list[tuple[str, Policy, float, dict[str, Any]]] = [
+        ("max pressure 10", pressure, 0.0, {}),
+        ("fixed", never, 0.0, {}),
+        ("random", chance, 0.0, {}),
+        ("constant", first, 0.0, {}),
+        ("greedy", weighed([0.0, 1.0, 0.0, 0.0]), 0.0, {}),
+        ("max pressure 5", pressure, 0.0, {"least_green": 5.0}),
+        ("max pressure 15", pressure, 0.0, {"least_green": 15.0}),
+    ]
+    if search_seconds > 0:
+        weights, seconds = searched(search_seconds, **keywords)
+        rows.append((f"searched {np.round(weights, 2).tolist()}", weighed(weights), seconds, {}))
+    for seed in range(seeds):
+        policy, seconds = trained(seed, steps, **keywords)
+        rows.append((f"PPO, seed {seed}", policy, seconds, {}))
+    cells, other = [], None
+    for name, policy, seconds, more in rows:
+        each = delays(made(episodes, **{**keywords, **more}), policy, FRESH)
+        other = each if other is None else other
+        apart = each - other
+        cells.append(
+            (
+                name,
+                f"{each.mean():.1f}",
+                f"{apart.mean():+.1f} ± {1.96 * apart.std(ddof=1) / len(apart) ** 0.5:.1f}",
+                f"{seconds:.0f}",
+            )
+        )
+        print(*cells[-1], flush=True)
+    print()
+    print(table(("", "delay (s)", "beside max pressure 10", "CPU s"), cells))
+
+
+if __name__ == "__main__":
+    command(signals)

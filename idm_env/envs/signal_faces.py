@@ -1,0 +1,218 @@
+"""Faces of the task ``signals``: a vector, one environment, and PettingZoo, where every signal is an agent.
+
+All worlds begin and end together: an episode has as many steps in each of them, and nothing ends it before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from pettingzoo import ParallelEnv
+
+from idm_env.tasks import KeywordError
+from idm_env.tasks.random import Draw
+from idm_env.tasks.signals import SignalsTask, SignalStep, World
+from idm_env.validation import nearest, shown, whole
+
+
+class _Worlds:
+    """Some worlds of the task, their seeds and the numbers of their episodes."""
+
+    def __init__(self, count: int, choices: dict[str, Any]) -> None:
+        names = [x.name for x in fields(SignalsTask)]
+        for name in choices:
+            if name not in names:
+                like = nearest(str(name), names)
+                raise KeywordError(f"task 'signals' got an unexpected keyword argument {shown(name)}.{like}")
+        if (limit := choices.pop("max_episode_steps", None)) is not None:
+            choices["duration"] = whole("max_episode_steps", limit, 1) * choices.get("hold", SignalsTask.hold)
+        self.task, self.count = SignalsTask(**choices), count
+        self.seeds, self.episodes = np.zeros(count, np.int64), np.full(count, -1)
+        self.world: World | None = None
+        self.done = 0
+
+    def seed(self, seeds: Sequence[int]) -> None:
+        """Begin anew with the first episodes of these seeds."""
+        self.seeds, self.episodes = np.array([s % (1 << 63) for s in seeds], np.int64), np.full(self.count, -1)
+
+    def begin(self) -> np.ndarray:
+        """Begin the next episode in all worlds; return observations ``[B, S, F]``."""
+        self.episodes += 1
+        self.done = 0
+        draw = Draw.of(torch.from_numpy(self.seeds), torch.from_numpy(self.episodes))
+        self.world = self.task.begin(draw)
+        return self.task.observe(self.world)
+
+    def step(self, actions: Any) -> tuple[np.ndarray, SignalStep, bool]:
+        """Do a step; return observations ``[B, S, F]``, the outcome, and whether the episodes are over.
+
+        RuntimeError before ``begin``; ValueError for actions (B, S) that are no phases.
+        """
+        if self.world is None:
+            raise RuntimeError("step was called before reset. Call reset() first.")
+        if self.done >= self.task.horizon:
+            raise RuntimeError("the episodes are over. Call reset() first.")
+        if actions is not None:
+            shape = (self.count, len(self.task.agents))
+            actions = np.asarray(actions)
+            if actions.shape != shape or actions.dtype.kind not in "iu" or (actions < 0).any():
+                raise ValueError(f"actions {shown(actions)} must be phases: whole numbers from 0 on, of shape {shape}.")
+        self.world, outcome = self.task.step(self.world, actions)
+        self.done += 1
+        return self.task.observe(self.world), outcome, self.done == self.task.horizon
+
+
+def _info(outcome: SignalStep) -> dict[str, np.ndarray]:
+    """Return an outcome's figures for infos, of each world ``[B]``."""
+    return {name: np.asarray(x) for name, x in outcome._asdict().items() if name != "reward"}
+
+
+class SignalsVectorEnv(VectorEnv):
+    """``gym.make_vec("DiffIDM-v0", num_envs=64, task="signals", network="grid 5x5")``; keywords: ``SignalsTask``.
+
+    A world's agents are one joint agent: observations one after the other, a phase for each, the mean of rewards. With
+    ``shared`` every agent of every world is an environment of its own, as one policy for all needs: Discrete actions,
+    ``num_envs`` times agents rows. Worlds reset within the step that ends them (``"SameStep"``). ``step(None)`` leaves
+    signals to their plans. Infos tell, of each world, vehicles ``inside``, ``waiting``, ``halting`` and ``arrived``,
+    and the time ``lost`` in the step (s).
+
+    Raises:
+        TypeError: For a keyword that does not exist, with a suggestion.
+        ValueError: For a value that cannot be; in one line, with value, rule and cure.
+    """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
+
+    def __init__(self, num_envs: int = 1, shared: bool = False, **choices: Any) -> None:
+        self.worlds = _Worlds(whole("num_envs", num_envs, 1), choices)
+        self.task, agents = self.worlds.task, len(self.worlds.task.agents)
+        self._shared, self._each = shared, agents if shared else 1
+        self.num_envs = num_envs * self._each
+        self._wide = self.task.features * (1 if shared else agents)
+        self.single_observation_space = Box(0.0, 1.0, (self._wide,), np.float32)
+        most = int(self.task.counts.max())
+        self.single_action_space = Discrete(most) if shared else MultiDiscrete(self.task.counts)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def _rows(self, x: np.ndarray) -> np.ndarray:
+        """Return the observation of every row."""
+        return x.reshape(self.num_envs, self._wide)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin episodes in all worlds, with a seed s the first of s + i in world i; return observations ``[n, F]``."""
+        if isinstance(seed, Sequence):
+            seed = next((s for s in seed if s is not None), None)
+        if seed is not None or self.worlds.world is None:
+            super().reset(seed=None if seed is None else whole("seed", seed, 0))
+            self.worlds.seed([int(self.np_random_seed or 0) + i for i in range(self.worlds.count)])
+        return self._rows(self.worlds.begin()), {}
+
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advance all worlds by ``hold`` seconds with phases ``[n]`` or ``[n, S]``; ValueError for what is no phase."""
+        chosen = None if actions is None else np.asarray(actions).reshape(self.worlds.count, -1)
+        seen, outcome, over = self.worlds.step(chosen)
+        reward = outcome.reward.reshape(-1) if self._shared else outcome.reward.mean(1)
+        rows = self._rows(seen)
+        info: dict[str, Any] = {name: np.repeat(x, self._each) for name, x in _info(outcome).items()}
+        info |= {f"_{name}": np.full(self.num_envs, True) for name in info}
+        ends = np.full(self.num_envs, over)
+        if over:
+            last, rows = rows, self._rows(self.worlds.begin())
+            info = {"final_obs": last, "final_info": info, "_final_obs": ends, "_final_info": ends}
+        return rows, reward, np.zeros(self.num_envs, bool), ends, info
+
+
+class SignalsEnv(gymnasium.Env):
+    """One world: ``gym.make("DiffIDM-v0", task="signals")``; as a row of ``SignalsVectorEnv``."""
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, **choices: Any) -> None:
+        self.worlds = _Worlds(1, choices)
+        self.task, agents = self.worlds.task, len(self.worlds.task.agents)
+        self.observation_space = Box(0.0, 1.0, (agents * self.task.features,), np.float32)
+        self.action_space = MultiDiscrete(self.task.counts)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin the first episode of ``seed`` if that is given, else the next one; return observations ``[S F]``."""
+        super().reset(seed=None if seed is None else whole("seed", seed, 0))
+        if seed is not None or self.worlds.world is None:
+            self.worlds.seed([self.np_random_seed])
+        return self.worlds.begin().reshape(-1), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Advance by ``hold`` seconds with phases ``[S]``; None leaves signals to their plans."""
+        seen, outcome, over = self.worlds.step(None if action is None else np.asarray(action)[None])
+        info = {name: x[0].item() for name, x in _info(outcome).items()}
+        return seen.reshape(-1), float(outcome.reward.mean(1)[0]), False, over, info
+
+
+class signals_parallel_env(ParallelEnv[str, np.ndarray, Any]):  # noqa: N801  (as PettingZoo names environments)
+    """PettingZoo: every signal is an agent, by its name; ``parallel_env(task="signals")``."""
+
+    metadata: dict[str, Any] = {"name": "diffidm_signals_v0", "is_parallelizable": True, "render_modes": []}  # noqa: RUF012
+
+    def __init__(self, max_cycles: int | None = None, **choices: Any) -> None:
+        if max_cycles is not None:
+            choices["max_episode_steps"] = max_cycles
+        self.worlds = _Worlds(1, choices)
+        self.task, self.render_mode = self.worlds.task, None
+        self.possible_agents = [*self.task.names]
+        self.agents: list[str] = []
+        wide = self.task.features
+        self.observation_spaces = {a: Box(0.0, 1.0, (wide,), np.float32) for a in self.possible_agents}
+        self.action_spaces = {a: Discrete(int(n)) for a, n in zip(self.possible_agents, self.task.counts, strict=True)}
+
+    def observation_space(self, agent: str) -> gymnasium.Space[Any]:
+        """Return the space of an agent's observations: the same object at every call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> gymnasium.Space[Any]:
+        """Return the space of an agent's actions: the same object at every call."""
+        return self.action_spaces[agent]
+
+    def _by_agent(self, values: Any) -> dict[str, Any]:
+        return dict(zip(self.possible_agents, values, strict=True))
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode: the first one of ``seed`` if that is given, the next one otherwise."""
+        if seed is not None or self.worlds.world is None:
+            self.worlds.seed([seeding.np_random(None if seed is None else whole("seed", seed, 0))[1]])
+        self.agents = [*self.possible_agents]
+        return self._by_agent(self.worlds.begin()[0]), {agent: {} for agent in self.agents}
+
+    def step(self, actions: dict[str, Any] | None) -> tuple[Any, Any, Any, Any, Any]:
+        """Advance by ``hold`` seconds with a phase of every agent; None in place of all of them: their plans.
+
+        ValueError for an agent without an action.
+        """
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        if actions is not None:
+            for agent in self.agents:
+                if agent not in actions:
+                    raise ValueError(f"there is no action for agent '{agent}'. Give one for each of env.agents.")
+        chosen = None if actions is None else np.array([[int(actions[a]) for a in self.agents]])
+        seen, outcome, over = self.worlds.step(chosen)
+        infos = {agent: {name: x[0].item() for name, x in _info(outcome).items()} for agent in self.agents}
+        ends = dict.fromkeys(self.agents, over)
+        self.agents = [] if over else self.agents
+        return (
+            self._by_agent(seen[0]),
+            self._by_agent(outcome.reward[0].tolist()),
+            dict.fromkeys(self.possible_agents, False),
+            ends,
+            infos,
+        )
