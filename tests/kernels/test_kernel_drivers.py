@@ -164,11 +164,14 @@ def test_all_members_are_in_some_group() -> None:
 
 
 FEW = (IDM(), Brakes(), make("delay"), make("memory"), make("second_leader"))
+OF_RECORDS = (IDM(), *(m for m in MEMBERS if m.name == "curve_over_lead_change_3s"), Brakes())
+"""What is seen of the past is the leader's alone: nothing of it has an adjoint."""
 
 
 @pytest.mark.parametrize(
     ("effects", "integration"),
-    [(g, INTEGRATIONS[i % 3]) for i, g in enumerate(GROUPS)] + [(FEW, "euler"), (FEW, "midpoint")],
+    [(g, INTEGRATIONS[i % 3]) for i, g in enumerate(GROUPS)]
+    + [(FEW, "euler"), (FEW, "midpoint"), (OF_RECORDS, "euler")],
     ids=lambda x: x if isinstance(x, str) else "+".join(e.name for e in x),
 )
 def test_values_and_derivatives_are_the_simulators(effects: tuple[Effect, ...], integration: str) -> None:

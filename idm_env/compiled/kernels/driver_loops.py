@@ -428,7 +428,8 @@ def adjoint(
                     fall(w, ah, plan, seen, same, places, now, wide, n)
                     for i in range(signals):
                         copy(w, plan.on_signals + i * ROW, ah, (now * signals + i) * wide, n)
-                    call(back[SENSE], w, m, k)  # type: ignore[call-arg]
+                    if back[SENSE]:  # what is seen of records alone has no adjoint
+                        call(back[SENSE], w, m, k)  # type: ignore[call-arg]
             if signals and first:
                 turn_back(ah, slots, signals, wide, n)
         if back[HOIST]:
