@@ -17,7 +17,7 @@ from idm_env.trajectories.spool import Spool
 from tests.commands import run
 from tests.data import bad
 
-NO_TRAJECTORIES = {"effects", "doctor", "predict"}
+NO_TRAJECTORIES = {"effects", "doctor", "predict", "network"}
 MORE = {"simulate": ("--base", "idm"), "fit --lane-changes": ("--lane-changes",)}
 COMMANDS = sorted(
     {typer.main.get_command_name(c.name or c.callback.__name__) for c in cli.app.registered_commands if c.callback}

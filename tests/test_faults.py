@@ -15,7 +15,9 @@ import pytest
 from idm_env.cli.commands import app
 from idm_env.data import synthetic
 from idm_env.jobs import storage
+from idm_env.roads import Network
 from tests.faults import Disturbed
+from tests.networks.written import write_net
 from tests.prediction.test_womd import write_json
 
 pytest.importorskip("numba")
@@ -33,6 +35,7 @@ COMMANDS = {
     "filter": ("=a.csv",),
     "reconstruct": ("=a.csv",),
     "predict": ("scene.json",),
+    "network": ("my.net.xml", "my.rou.xml", "--seconds", 10),
 }
 SIGNATURES = {
     c.name or c.callback.__name__: inspect.signature(c.callback) for c in app.registered_commands if c.callback
@@ -51,6 +54,9 @@ def disturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disturbed]:
     table.with_columns(texts).write_csv(folder / "=a.csv")
     table.write_csv(folder / "b.csv")
     write_json(folder / "scene.json")
+    write_net(folder / "my.net.xml", Network.crossing())
+    flow = '<flow id="=a" from="left0A0" to="A0right0" begin="0" end="9" period="3"/>'
+    (folder / "my.rou.xml").write_text(f"<routes>{flow}</routes>")
     made = Disturbed(folder)
     yield made
     made.close()

@@ -80,7 +80,7 @@ def test_effects_are_sought_on_the_law_of_the_data_too(tmp_path: Path) -> None:
     rows = report["bases"]
     assert rows[0]["base"] == "iidm" and {row["base"] for row in rows if not row["own"]} == set(BASES)
     assert rows[-1]["own"] == [name for name, effect in ALL.items() if effect.per_driver]
-    assert "every driver's own" in rows[-1]["title"]
+    assert "own strengths" in rows[-1]["title"]
     error = {row["base"]: row["gap_rmse_m"] for row in rows if not row["own"]}
     assert min(error, key=error.get) == "idm"  # type: ignore[arg-type]
     assert_a_model_has_one_figure(report)

@@ -61,10 +61,11 @@ def test_report_files(drag: Discovery, tmp_path: Path) -> None:
 
 
 def test_nothing_is_found_where_nothing_is_hidden() -> None:
-    # Noise of drivers hides what is not there as well as what is: then nothing is ruled out.
-    for ou, verdicts in ((0.0, ["none"]), (0.3, ["cannot_tell", "undecided"])):
+    # Noise of drivers hides what is not there as well as what is, unless the errors look like it in every test.
+    for ou, verdicts in ((0.0, ["none"]), (0.3, ["cannot_tell", "undecided", "none"])):
         found = discover(data(None, ou=ou), effects=FEW)
         assert found.verdict in verdicts
+        assert not ou or "unsteady drivers" in found.report["sentence"]
         assert found.report["found"] == []
         assert found.report["error"]["after"] == found.report["error"]["before"]
 
