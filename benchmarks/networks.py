@@ -218,5 +218,8 @@ def control(flow: float = 250.0, left: float = 0.1, seed: int = 1) -> None:
     print(table(("signals", "ours", "SUMO", "difference"), rows))
 
 
+main = {"travel": travel, "saturation": saturation, "control": control}
+"""Its tables."""
+
 if __name__ == "__main__":
-    command({"travel": travel, "saturation": saturation, "control": control})
+    command(main)

@@ -125,7 +125,7 @@ def trained(seed: int, steps: int, **keywords: Any) -> tuple[Policy, float]:
     return choose, time.process_time() - start
 
 
-def signals(
+def main(
     inflow: float = 300.0, network: str = "grid 5x5", search_seconds: float = 30.0, steps: int = 1_000_000,
     seeds: int = 5, episodes: int = EPISODES,
 ) -> None:  # fmt: skip
@@ -171,4 +171,4 @@ def signals(
 
 
 if __name__ == "__main__":
-    command(signals)
+    command(main)

@@ -17,7 +17,7 @@ for seed in range(3):
     ended = False
     while not ended:
         # A gap of 2 m and 1.5 s, at the leader's speed; observations are divided by their scales.
-        speed, lead_speed, gap = observation * env.unwrapped.task.features.scales
+        speed, lead_speed, gap = observation * env.unwrapped.task.scales
         accel = 0.1 * (gap - 2.0 - 1.5 * speed) + 0.6 * (lead_speed - speed)
         action = env.action_space.low + 0.5 * (accel / 3.0 + 1.0) * (env.action_space.high - env.action_space.low)
         observation, _, terminated, truncated, _ = env.step(action.clip(-1.0, 1.0).astype("float32"))

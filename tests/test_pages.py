@@ -126,7 +126,7 @@ def test_a_newcomer_finds_in_two_clicks_what_is_asked_most(site: Path) -> None:
     near = links(site, "index.html")
     near |= {link for first in near for link in links(site, first)}
     for place, words in (
-        *((f"generated/tasks/{name}.html", make_task(name).features.names[-1]) for name in TASKS),
+        *((f"generated/tasks/{name}.html", make_task(name).bounds.names[-1]) for name in TASKS),
         ("jobs/files.html", "position_m"),
         ("generated/effects.html", "speed-dependent gap"),
         ("architecture.html", "Add a task"),

@@ -217,7 +217,7 @@ class Loop:
     def roll(
         self, rows: Any, theta: np.ndarray, phi: np.ndarray, on: np.ndarray, tables: np.ndarray, pulse: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return gap and speed [C, R, samples] of rows; θ [C, G, P], φ [C, G, …], ``pulse`` [C, 3] or [0, 3]."""
+        """Return gap and speed [C, R, samples] of rows; θ [C, G, P], φ [C, G, …], ``pulse`` [C, 4] or [0, 4]."""
         records, module = rows.records, library.load("march", self.text)
         working = [e for e, is_on in zip(self.catalogue.flagged, on, strict=True) if is_on]
         is_wound, lead = lead_steps(working, records.dt)
@@ -263,14 +263,18 @@ def loop(catalogue: Catalogue, dt: float) -> Loop:
 def pulsed(catalogue: Catalogue, pulse: np.ndarray, on: np.ndarray, phi: np.ndarray) -> np.ndarray:
     """Set flags [flags] and weights of pulses [copies, 4]: place in ``PULSED`` + 1 or 0, first step, end step, amount.
 
-    Returns what the loop takes of them [copies, 3].
+    Returns what the loop takes of them [copies, 4]: steps, and the amount as a change or as a push. All copies have the
+    same flags: a push has no weight that would keep it from the others.
     """
+    steps = np.column_stack([pulse[:, 1:], np.zeros(len(pulse))])
     for copy in np.flatnonzero(pulse[:, 0]):
         name, weights = catalogue.shape(PULSED[int(pulse[copy, 0]) - 1], "", PULSE)
         on[catalogue.flags[name]] = 1
+        if not any(weights.values()):
+            steps[copy, 2:] = 0.0, pulse[copy, 3]
         for weight, value in weights.items():
             phi[copy, :, catalogue.index[weight]] = value
-    return np.ascontiguousarray(pulse[:, 1:])
+    return steps
 
 
 def back_steps(effects: Sequence[Effect], dt: float) -> int:
@@ -288,7 +292,7 @@ def _printed(catalogue: Catalogue, dt: float) -> Loop:
             raise ValueError(f"effect '{name}' is a profile and does not read it by effects.places.curve.")
     memories = list(recorded.begin)
     driver = {f"{name}.{p.name}": f"th[{i}]" for i, (name, p) in enumerate(catalogue.of_driver)}
-    inputs = {slot_name(e.name, ""): "state[PULSE]" for e in _slots(PULSE)}
+    inputs = {slot_name(e.name, ""): f"state[{'PUSH' if isinstance(e, Push) else 'PULSE'}]" for e in _slots(PULSE)}
     for effect in catalogue.effects:
         inputs |= {slot_name(effect.name, part): text for part, text in _BESIDE.items()}
 

@@ -87,7 +87,7 @@ class Problem:
             values = np.broadcast_to(values[:, None], (len(theta), self.groups, values.shape[-1]))
         catalogue, on = model.catalogue, model.on
         phi = np.ascontiguousarray(model.phi(values))
-        pulse = np.zeros((0, 3)) if pulse is None else march.pulsed(catalogue, pulse, on, phi)
+        pulse = np.zeros((0, 4)) if pulse is None else march.pulsed(catalogue, pulse, on, phi)
         return march.loop(catalogue, self.rows.records.dt).roll(self.rows, np.exp(theta), phi, on, model.tables, pulse)
 
     def errors(

@@ -68,13 +68,13 @@ def test_the_ring_varies_by_more_than_hundredths():
 def test_raw_is_si_and_scaled_is_raw_over_documented_scales(task):
     scaled, raw = (gym.make("DiffIDM-v0", task=task, observation=kind) for kind in ("scaled", "raw"))
     first, second = scaled.reset(seed=3)[0], raw.reset(seed=3)[0]
-    scales = np.tile(scaled.unwrapped.task.features.scales, len(scaled.unwrapped.task.agents))
+    scales = np.tile(scaled.unwrapped.task.scales, len(scaled.unwrapped.task.agents))
     np.testing.assert_allclose(first * scales, second, rtol=1e-6)
     agent = raw.unwrapped.task.agents[0]
     state = raw.unwrapped.state
     there = 1.0 if state.present is None else float(state.present[0, agent])  # on merge the ego comes within 3 s
     assert second[0] == pytest.approx(there * float(state.speed[0, agent]))
-    high = np.tile(np.float32(raw.unwrapped.task.features.high), len(raw.unwrapped.task.agents))
+    high = np.tile(np.float32(raw.unwrapped.task.bounds.high), len(raw.unwrapped.task.agents))
     np.testing.assert_array_equal(raw.observation_space.high, high)
 
 

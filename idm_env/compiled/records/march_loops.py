@@ -19,9 +19,9 @@ from idm_env.compiled.kernels.functions import exp_float64 as exp, power_float64
 log1p, tanh = np.log1p, np.tanh
 ROOM = 68
 LANES = 8
-SPEED, ACCEL, DISPLACEMENT, POSITION, GAP, LENGTH, LEAD_SPEED, LEAD_ACCEL, STEP, PLACE, PULSE, OFFSET = range(12)
+SPEED, ACCEL, DISPLACEMENT, POSITION, GAP, LENGTH, LEAD_SPEED, LEAD_ACCEL, STEP, PLACE, PULSE, OFFSET, PUSH = range(13)
 """Rows of ``state``; the first three those of ``moved``, memories at the beginning behind them."""
-COLUMN = 12
+COLUMN = 13
 """The row of ``state`` with the first column of the record; of these those are filled that somebody reads."""
 SAMPLE, LANE, DRIVER, ROW, COPY, ORIGIN, FIRST, LAST = range(8)
 """Rows of ``index``: the sample of now, the lane, place in φ, row, copy; first samples of the row and of its record."""
@@ -122,8 +122,9 @@ def advance(index, state, moved, t):
 def push(signals, index, state, t, pulse):
     """Load the pulses of now."""
     for lane in range(LANES):
-        begin, end, amount = pulse[index[COPY, lane]]
-        state[PULSE, lane] = amount * signals[index[SAMPLE, lane], 19] if begin <= t < end else 0.0
+        begin, end, change, added = pulse[index[COPY, lane]]
+        now = signals[index[SAMPLE, lane], 19] if begin <= t < end else 0.0
+        state[PULSE, lane], state[PUSH, lane] = change * now, added * now
 
 
 @compiled
@@ -156,9 +157,9 @@ def march(
     it is placed on the record and responds; memories begin there, or are ``wound`` already. ``theta``
     [copies, groups, P]; ``phi`` [copies · groups, …] and ``flags`` as a catalogue lays them out: what a step reads of φ
     is ``used``, of others in the record ``seen``; ``tables`` [tables, 3] is (form, number of knots, place in φ);
-    ``back`` is how many steps of the past are kept; ``pulse`` [copies, 3] is (first step, end step, amount), times the
-    last column of ``signals``; ``k`` are constants that depend on dt. Every ``every`` steps a sample is kept; rows in
-    which a record ends keep their last state.
+    ``back`` is how many steps of the past are kept; ``pulse`` [copies, 4] is (first step, end step, change, push), of
+    which the last two are times the last column of ``signals``; ``k`` are constants that depend on dt. Every ``every``
+    steps a sample is kept; rows in which a record ends keep their last state.
 
     Where there are ``ends``, ``wound`` [copies, rows, memories] is filled instead: a lane goes through a record from
     its beginning to ``start``, for rows ``order[ends[i] : ends[i + 1]]``, which begin at the samples ``settle`` [rows].
