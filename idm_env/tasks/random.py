@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.compiled.kernels import available, threads
+from idm_env.compiled.kernels import may_run, threads
 
 
 def _signed(x: int) -> int:
@@ -94,7 +94,7 @@ class Draw(NamedTuple):
 
     def _halves(self, counter: Tensor, steps: int, pairs: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Return both halves of hashes ``(steps, environments, pairs)``, of counters at the first step."""
-        if self.key.device.type == "cpu" and available():
+        if self.key.device.type == "cpu" and may_run():
             from idm_env.compiled.kernels.counter_loops import halves
 
             high, low = torch.empty(2, steps, len(self.key), pairs, dtype=dtype)

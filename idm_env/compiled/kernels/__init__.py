@@ -23,3 +23,8 @@ def available() -> bool:
     if SWITCHED_OFF:
         warnings.warn("no compiled step, the torch path runs instead: NUMBA_DISABLE_JIT is set.", stacklevel=2)
     return not SWITCHED_OFF and find_spec("numba") is not None
+
+
+def may_run() -> bool:
+    """Return whether kernels are available, and not switched off by ``IDM_ENV_KERNELS=0``."""
+    return os.environ.get("IDM_ENV_KERNELS", "1") != "0" and available()
