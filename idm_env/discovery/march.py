@@ -268,9 +268,10 @@ def pulsed(catalogue: Catalogue, pulse: np.ndarray, on: np.ndarray, phi: np.ndar
     """
     steps = np.column_stack([pulse[:, 1:], np.zeros(len(pulse))])
     for copy in np.flatnonzero(pulse[:, 0]):
-        name, weights = catalogue.shape(PULSED[int(pulse[copy, 0]) - 1], "", PULSE)
+        what = PULSED[int(pulse[copy, 0]) - 1]
+        name, weights = catalogue.shape(what, "", PULSE)
         on[catalogue.flags[name]] = 1
-        if not any(weights.values()):
+        if what == "acceleration":
             steps[copy, 2:] = 0.0, pulse[copy, 3]
         for weight, value in weights.items():
             phi[copy, :, catalogue.index[weight]] = value

@@ -206,7 +206,8 @@ class signals_parallel_env(ParallelEnv[str, np.ndarray, Any]):  # noqa: N801  (a
                     raise ValueError(f"there is no action for agent '{agent}'. Give one for each of env.agents.")
         chosen = None if actions is None else np.array([[int(actions[a]) for a in self.agents]])
         seen, outcome, over = self.worlds.step(chosen)
-        infos = {agent: {name: x[0].item() for name, x in _info(outcome).items()} for agent in self.agents}
+        figures = {name: x[0].item() for name, x in _info(outcome).items()}
+        infos = {agent: dict(figures) for agent in self.agents}
         ends = dict.fromkeys(self.agents, over)
         self.agents = [] if over else self.agents
         return (

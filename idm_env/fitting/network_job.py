@@ -139,8 +139,7 @@ class _Traffic:
         }
         links |= {"mean_vehicles": vehicles / self.samples, "mean_halting": halting / self.samples}
         links["mean_speed_mps"] = [s / n if n else None for s, n in zip(speed.tolist(), vehicles.tolist(), strict=True)]
-        assert self.state.lanes is not None and self.state.lanes.journeys is not None
-        ways, dt = self.state.lanes.journeys, self.simulator.dt
+        ways, dt = junctions.journeys_of(self.state), self.simulator.dt
         used = [row[row >= 0] for row in demand.routes]
         free = np.array([(network.length[r] / network.limit[r]).sum() for r in used])
         ends = (("from", 0), ("to", -1))

@@ -26,6 +26,9 @@ from idm_env.types import FAR, Journeys, Params, State, worthwhile
 NEVER = 1 << 30
 """Step at which those are due who never are."""
 
+HALTING = 0.1
+"""Speed below which a vehicle stands (m/s), as in SUMO."""
+
 LED, ENTERED, ENTERED_BEHIND = 1, 2, 3
 """What is new of a vehicle: its leader, itself, itself at its leader's speed."""
 
@@ -198,20 +201,25 @@ def _own(demand: Demand, name: str, otherwise: float) -> list[float]:
 
 def showing(state: State, phases: Tensor) -> State:
     """Return the state with these phases of signals, ``(..., signals)``; −1 leaves a signal to its plan."""
-    links = state.lanes
-    assert links is not None and links.journeys is not None
-    phases = phases.to(links.journeys.phases.dtype).expand(links.journeys.phases.shape)
-    return state._replace(lanes=links._replace(journeys=links.journeys._replace(phases=phases)))
+    ways = journeys_of(state)
+    assert state.lanes is not None
+    phases = phases.to(ways.phases.dtype).expand(ways.phases.shape)
+    return state._replace(lanes=state.lanes._replace(journeys=ways._replace(phases=phases)))
 
 
 # -- what can be read --------------------------------------------------------------------------------------------------
 
 
+def journeys_of(state: State) -> Journeys:
+    """Return the journeys ``(..., n)`` in a network's state."""
+    assert state.lanes is not None and state.lanes.journeys is not None
+    return state.lanes.journeys
+
+
 def counts(state: State) -> Counts:
     """Return the trips of every row: due by now; of these inside, left, and queued for want of room."""
-    links = state.lanes
-    assert links is not None and links.journeys is not None and state.present is not None
-    ways = links.journeys
+    ways = journeys_of(state)
+    assert state.present is not None
     # Who is due between two events waits for the next one.
     due, inside, left = (ways.due <= state.clock), state.present > 0, ways.left >= 0
     due = due | (ways.entered >= 0)
@@ -228,7 +236,7 @@ def deadlocked(stepping: CarFollowingStep, state: State, params: Params) -> Tens
     own = torch.arange(state.speed.shape[-1], device=state.speed.device).expand(state.speed.shape)
     near = (event.new == 0) & (state.gap < rules_of(stepping, params)[1][1] + 1.0)
     then = torch.where(event.waits >= 0, event.waits.long(), torch.where(near, event.leader, own))
-    then = torch.where((event.present > 0) & (state.speed < 0.1), then, own)
+    then = torch.where((event.present > 0) & (state.speed < HALTING), then, own)
     after = then
     for _ in range(own.shape[-1].bit_length()):  # where everybody ends who goes on from one to the next
         after = after.gather(-1, after)
@@ -250,16 +258,15 @@ class LinkCounts(NamedTuple):
 
 def by_link(network: Network, state: State) -> LinkCounts:
     """Return how many vehicles are on every link, stand there, wait to enter it, and how fast they are."""
-    links = state.lanes
-    assert links is not None and links.journeys is not None and state.present is not None
-    here, ways = state.present, links.journeys
+    here, ways, lanes = state.present, journeys_of(state), state.lanes
+    assert here is not None and lanes is not None
     waits = ((ways.due <= state.clock) & (ways.entered < 0)).to(here.dtype)
 
     def summed(x: Tensor) -> Tensor:
         zero = x.new_zeros((*x.shape[:-1], len(network.names)))
-        return zero.scatter_add(-1, links.lane, x)
+        return zero.scatter_add(-1, lanes.lane, x)
 
-    vehicles, halting, speed = summed(here), summed(here * (state.speed < 0.1)), summed(here * state.speed)
+    vehicles, halting, speed = summed(here), summed(here * (state.speed < HALTING)), summed(here * state.speed)
     limit = torch.from_numpy(network.limit.copy()).to(speed.dtype)
     mean = torch.where(vehicles > 0, speed / vehicles.clamp_min(1.0), limit)
     return LinkCounts(vehicles, halting, summed(waits), mean)
@@ -267,8 +274,6 @@ def by_link(network: Network, state: State) -> LinkCounts:
 
 def travel_time(stepping: CarFollowingStep, state: State) -> Tensor:
     """Return each vehicle's time from when it was due to when it left, or until now (s); 0 where it is not due yet."""
-    links = state.lanes
-    assert links is not None and links.journeys is not None
-    ways = links.journeys
+    ways = journeys_of(state)
     until = torch.where(ways.left >= 0, ways.left, state.clock)
     return ((until - ways.due).clamp_min(0) * stepping.dt).to(state.speed.dtype)

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from idm_env.effects import IDM, Brakes, Effect, LinkLimit, StopLine
-from idm_env.multilane.junctions import NEVER, of_kinds, showing, travelling
+from idm_env.multilane.junctions import HALTING, NEVER, journeys_of, of_kinds, showing, travelling
 from idm_env.roads.network import Array, Network, padded
 from idm_env.roads.network_demand import Demand
 from idm_env.roads.ways import Ways, keyed
@@ -32,8 +32,6 @@ from idm_env.tasks.random import Draw
 from idm_env.types import Journeys, State, mapped
 from idm_env.validation import one_of, shown
 
-HALTING = 0.1
-"""Speed below which a vehicle stands (m/s), as in SUMO."""
 REWARDS = ("unit", "delay", "queue", "pressure")
 _ROUTES = 256
 """Routes from each entry, drawn once, among which every vehicle chooses."""
@@ -274,7 +272,7 @@ class SignalsTask:
 
     def begin(self, draw: Draw) -> World:
         """Return worlds at the beginning of an episode: empty, with everybody's departure drawn."""
-        rows, agents, journeys = len(draw.key), len(self.agents), _journeys(self._empty)
+        rows, agents, journeys = len(draw.key), len(self.agents), journeys_of(self._empty)
 
         def of_row(x: torch.Tensor) -> torch.Tensor:
             return x.expand(rows, *x.shape).clone()
@@ -367,7 +365,7 @@ class SignalsTask:
     def _outcome(self, first: World, last: World) -> SignalStep:
         """Return the outcome of a step; a vehicle's lost time counts for the agent before which it was at first."""
         begin, end = (int(world.state.step.reshape(-1)[0]) for world in (first, last))
-        ways, agents = _journeys(first.state), len(self.agents)
+        ways, agents = journeys_of(first.state), len(self.agents)
         # Who is due, and had not left: the rest has nothing to tell.
         some = np.flatnonzero(((ways.due <= end) & (ways.left < 0)).numpy())
         then, now = (_Here(world.state, some) for world in (first, last))
@@ -387,14 +385,14 @@ class SignalsTask:
             reward = (now.sums(now.inside, behind, agents + 1) - now.sums(now.inside, before, agents + 1))[:, :agents]
         whole = np.zeros_like(before)
         lost, inside, waiting, halting = (now.sums(x, whole, 1)[:, 0] for x in (lost, now.inside, waits, now.halting))
-        return SignalStep(reward, lost, inside, waiting, halting, (_journeys(last.state).left >= 0).sum(-1).numpy())
+        return SignalStep(reward, lost, inside, waiting, halting, (journeys_of(last.state).left >= 0).sum(-1).numpy())
 
 
 class _Here:
     """Links, routes and places of some vehicles, given by their index among those of all worlds."""
 
     def __init__(self, state: State, some: Array) -> None:
-        (self.rows, n), journeys = state.position.shape, _journeys(state)
+        (self.rows, n), journeys = state.position.shape, journeys_of(state)
         assert state.lanes is not None
         own = (state.lanes.lane, *(getattr(journeys, k) for k in ("route", "hop", "due", "left")), *state[:2])
         self.link, self.route, self.hop, self.due, self.leaves, self.position, speed = (
@@ -407,12 +405,6 @@ class _Here:
         """Return the sums of weights over the vehicles on links of one group ``(B, groups)``."""
         cells = group[self.link] + groups * self.row
         return np.bincount(cells, weight, self.rows * groups).reshape(self.rows, groups)
-
-
-def _journeys(state: State) -> Journeys:
-    """Return the journeys of a network's state."""
-    assert state.lanes is not None and state.lanes.journeys is not None
-    return state.lanes.journeys
 
 
 def _present(state: State) -> torch.Tensor:

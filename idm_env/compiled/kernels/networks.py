@@ -176,9 +176,7 @@ def kernel_of(simulator: Simulator, state: State, inputs: Inputs) -> TileKernel 
     if state.lanes is None or state.lanes.journeys is None:
         return "nobody has a route"
     kernel = tile_kernel(inner_of(simulator), Form.of(state._replace(lanes=None), inputs))
-    if not isinstance(kernel, str) and {"leads", "present"} & {*kernel.program.statics, *kernel.program.states} - {
-        "present"
-    }:
+    if not isinstance(kernel, str) and "leads" in (*kernel.program.statics, *kernel.program.states):
         return "an effect looks back, and on networks several vehicles may be behind one"
     return kernel
 
