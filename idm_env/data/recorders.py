@@ -1,12 +1,16 @@
-"""Clocks of recorders, one in each car, that are apart: found by how drivers answer their leaders, and put together.
+"""Clocks of recorders, one in each car, that are apart: found and put together.
 
-A driver's acceleration is linear in the terms of IDM, with any parameters, at the time at which his leader's record is
-right. With the leader's clock ahead of his by δ the least squares are least at that shift. A car whose clock is off
-shifts the one behind by as much as it shifts itself, the other way: shifts of neighbours are opposite, as those of
-drivers who delay or look ahead are not. What a second leader foretells is a shift, too, unless it is among the terms.
+Where a car measures its gap, the rate of that gap is the difference of both speeds at one time: a leader's clock that
+is ahead by δ shows as the shift at which they agree best, and how drivers answer is not asked. Gaps from positions
+agree with speeds at any shift. There a driver's acceleration is linear in the terms of IDM, with any parameters, at the
+time at which his leader's record is right. A car whose clock is off shifts the one behind by as much as it shifts
+itself, the other way: shifts of neighbours are opposite and of both signs. Shifts of one sign are delays, or foresight.
+What a second leader foretells is a shift, too, unless it is among the terms.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import polars as pl
@@ -37,8 +41,9 @@ def on_one_clock(trajectories: Trajectories) -> Trajectories:
     gap = pl.when(pl.col("gap_measured")).then("gap_m").alias("gap_m")
     table = table.with_columns(gap, pl.col("time_s") - pl.col("offset").fill_null(0.0))
     shifted = Trajectories.from_frame(table.drop("gap_measured", "offset"), source=trajectories.source)
-    words = f"recorders have clocks up to {np.ptp([0.0, *offsets.values()]):.1f} s apart, by how drivers answer their "
-    words += "leaders; times were shifted. A delay that all drivers share cannot be told from them."
+    ways = "how drivers answer their leaders (a delay that all share looks alike)", "rates of measured gaps"
+    by = ways[trajectories.table["gap_measured"].any()]
+    words = f"recorders have clocks up to {np.ptp([0.0, *offsets.values()]):.1f} s apart, by {by}; times were shifted."
     repairs = (*trajectories.repairs, *repaired("clocks apart", len(offsets), words))
     return replace(trajectories, table=shifted.table, steps=shifted.steps, repairs=repairs)
 
@@ -49,28 +54,32 @@ def clock_offsets(trajectories: Trajectories) -> dict[tuple[str, str], float]:
     counts = pl.DataFrame(trajectories.followers(), schema=TRACK, orient="row")["run_id"].value_counts()
     few = counts.filter(pl.col("count") <= MOST_DRIVERS).sort("run_id")
     some = few.filter(pl.col("count").cum_sum() <= MOST_DRIVERS)["run_id"].to_list()
-    items = _long_episodes(trajectories, some)
+    measured = bool(trajectories.table["gap_measured"].any())
+    errors = (_rate_error, _rate_error) if measured else (_response_error, partial(_response_error, second=True))
+    items = _long_episodes(trajectories, some, not measured)
     by_track = {(e.run_id, e.vehicle_id): i for i, e in enumerate(items)}
     ahead = [(i, by_track[e.run_id, e.leader_id]) for i, e in enumerate(items) if (e.run_id, e.leader_id) in by_track]
     if len(ahead) < LEAST_PAIRS or items[0].dt > HALF_S:
         return {}
-    bare, both = (np.array([[_shift(e, p, second) for p in _parts(e)] for e in items]) for second in (False, True))
+    bare, both = (np.array([[_shift(e, p, error) for p in _parts(e)] for e in items]) for error in errors)
     i, j = np.array(ahead).T
     opposite, rest = (np.corrcoef(x[i, 0], x[j, 0])[0, 1] for x in (bare, both))
     lasting, spread = np.corrcoef(bare[:, 1], bare[:, 2])[0, 1], bare[:, 0].std()
     is_second = rest > 0.0 or both[:, 0].std() < 0.5 * spread
-    if is_second or opposite > OPPOSITE or lasting < LASTING or spread < LEAST_SPREAD_S:
+    is_one_sided = min(bare[:, 0].max(), -bare[:, 0].min()) < LEAST_SPREAD_S
+    if is_second or is_one_sided or opposite > OPPOSITE or lasting < LASTING or spread < LEAST_SPREAD_S:
         return {}
-    items = _long_episodes(trajectories, few["run_id"].to_list())
-    single = [_shift(e, _parts(e)[0], False) for e in items]
+    items = _long_episodes(trajectories, few["run_id"].to_list(), not measured)
+    single = [_shift(e, _parts(e)[0], errors[0]) for e in items]
     shifts = {(e.run_id, e.vehicle_id): (e.leader_id, _usual(items, single, e)) for e in items}
     return {track: _offset(shifts, *track) for track in shifts}
 
 
-def _long_episodes(trajectories: Trajectories, runs: list[str]) -> list[Episode]:
+def _long_episodes(trajectories: Trajectories, runs: list[str], smooth: bool) -> list[Episode]:
     """Return the drivers of some runs who follow long enough."""
     try:
-        return [e for e in episodes(trajectories.of_runs(runs), smooth=True) if e.seconds >= SHORTEST_S] if runs else []
+        some = episodes(trajectories.of_runs(runs), smooth=smooth) if runs else ()
+        return [e for e in some if e.seconds >= SHORTEST_S]
     except DataError:
         return []
 
@@ -97,20 +106,33 @@ def _parts(episode: Episode) -> list[np.ndarray]:
     return [np.ones(len(episode), bool), first, ~first]
 
 
-def _shift(e: Episode, part: np.ndarray, second: bool) -> float:
-    """Return the shift of the leader's record (s) at which IDM's terms explain a driver best, by parabola."""
-    errors = np.array([_error(e, shift, part, second) for shift in SHIFTS])
+def _shift(e: Episode, part: np.ndarray, error: Callable[[Episode, float, np.ndarray], float]) -> float:
+    """Return the shift of the leader's record (s) at which an error is least, by parabola."""
+    errors = np.array([error(e, shift, part) for shift in SHIFTS])
     k = min(max(int(errors.argmin()), 1), len(SHIFTS) - 2)
     a, b, c = errors[k - 1 : k + 2]
     move = np.clip(0.5 * (a - c) / (a - 2 * b + c), -1, 1) if a - 2 * b + c > 0 else 0.0
     return float(SHIFTS[k] + move * (SHIFTS[1] - SHIFTS[0]))
 
 
-def _error(e: Episode, shift: float, part: np.ndarray, second: bool) -> float:
+def _inner(e: Episode, part: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
+    """Return half a difference's samples, times (s), and which moving samples of ``part`` [T] all shifts have."""
+    time, edge = np.arange(len(e)) * e.dt, HALF_S + e.dt + SHIFTS[-1]
+    use = part & (e.speed_mps > 0.5) & (time >= edge) & (time < time[-1] - edge)
+    return max(1, round(HALF_S / e.dt)), time, use
+
+
+def _rate_error(e: Episode, shift: float, part: np.ndarray) -> float:
+    """Return the mean square of the measured gap's rate less the difference of speeds (m²/s²)."""
+    k, time, use = _inner(e, part)
+    rate = (np.roll(e.gap_m, -k) - np.roll(e.gap_m, k)) / (2 * k * e.dt)
+    left = rate - np.interp(time + shift, time, e.leader.speed_mps) + e.speed_mps
+    return float((left[use] ** 2).mean()) if use.any() else 0.0
+
+
+def _response_error(e: Episode, shift: float, part: np.ndarray, second: bool = False) -> float:
     """Return the mean square of the residual accelerations (m²/s⁴), at the samples of ``part`` [T]."""
-    k, time, v = max(1, round(HALF_S / e.dt)), np.arange(len(e)) * e.dt, e.speed_mps
-    edge = HALF_S + e.dt + SHIFTS[-1]
-    use = part & (v > 0.5) & (time >= edge) & (time < time[-1] - edge)
+    (k, time, use), v = _inner(e, part), e.speed_mps
     accel, own = (np.roll(v, -k) - np.roll(v, k))[use] / (2 * k * e.dt), v[use] / 10.0
     terms = [np.ones(len(accel)), own**4]
     for other in (e.leader, e.second_leader) if second and e.second_leader.present.all() else (e.leader,):

@@ -144,11 +144,6 @@ class Hypothesis:
         return [self.catalogue.by_name[t.effect] for t in self.terms if t.effect is not None]
 
     @property
-    def at_work(self) -> list[Effect]:
-        """What the loop has for the terms."""
-        return [e for e, on in zip(self.catalogue.flagged, self.on, strict=True) if on]
-
-    @property
     def on(self) -> np.ndarray:
         """Flags [effects] of those that are at work."""
         on = np.zeros(len(self.catalogue.flags), np.int8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -20,10 +21,10 @@ def platoons(effect: str | None = None) -> Trajectories:
     return synthetic.generate(1, runs=6, seconds=100.0, effect=effect, noise=0.1)[0]
 
 
-def apart(trajectories: Trajectories) -> Trajectories:
+def apart(trajectories: Trajectories, without: Sequence[str] = ("gap_m", "gap_measured")) -> Trajectories:
     """The same platoons, every car with a logger of its own clock."""
     seconds = pl.col("vehicle_id").replace_strict(OFFSETS, return_dtype=pl.Float64)
-    table = trajectories.table.drop("gap_m", "gap_measured").with_columns((pl.col("time_s") + seconds).round(3))
+    table = trajectories.table.drop(without).with_columns((pl.col("time_s") + seconds).round(3))
     return Trajectories.from_frame(table)
 
 
@@ -50,6 +51,22 @@ def test_loggers_of_several_clocks_are_put_on_one() -> None:
 def test_one_clock_stays_as_it_is_whatever_drivers_do(effect: str | None) -> None:
     trajectories = platoons(effect)
     assert clock_offsets(trajectories) == {} and on_one_clock(trajectories) is trajectories
+
+
+@pytest.mark.parametrize("has_gaps", [False, True])
+def test_one_clock_stays_as_it_is_where_drivers_delay_and_foresee_unlike(has_gaps: bool) -> None:
+    """Shifts of 24 drivers happen to be opposite for neighbours; all are of one sign, as answers are."""
+    both = {"delay": 0.5, "leader_acceleration": 0.4}
+    drivers = synthetic.generate(4, runs=6, seconds=100.0, effect=both, gap_column=has_gaps)[0]
+    assert clock_offsets(drivers) == {}
+
+
+def test_measured_gaps_tell_clocks_whatever_drivers_do() -> None:
+    measured = synthetic.generate(1, runs=6, seconds=100.0, effect="delay", gap_column=True)[0]
+    assert clock_offsets(measured) == {}
+    offsets = clock_offsets(apart(measured, without=["gap_measured"]))
+    assert len(offsets) == 18
+    assert all(abs(seconds - OFFSETS[vehicle]) < 0.1 for (_, vehicle), seconds in offsets.items())
 
 
 def test_nobody_behind_a_follower_tells_no_clock() -> None:
