@@ -10,22 +10,33 @@ episodes of 900 s; ± is 95 % of the paired difference to *max pressure 10*. Row
 * *searched*: vehicles, those that stand, those behind and a bonus for the present phase, weighed by four numbers that a
   cross-entropy search finds on other episodes in ``--search-seconds`` of CPU time;
 * *PPO*: Stable-Baselines3's with ``VecNormalize``, one policy for all signals, several seeds, each its last policy.
+
+``--sumo 8`` drives the first eight of these episodes inside SUMO, too: netgenerate's grid, the same vehicles, the same
+code that observes and judges. That column is SUMO's delay, less ours in the same episodes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 
 import idm_env  # noqa: F401 (registers the environments)
 from benchmarks import command, table
 from benchmarks.bench.measure import machine
+from benchmarks.bench.peers import started
+from benchmarks.networks import GRID, generated, network_of, routes_xml
 from idm_env.envs.signal_faces import SignalsVectorEnv
-from idm_env.multilane.junctions import by_link
+from idm_env.multilane.junctions import by_link, journeys_of
+from idm_env.roads.network_demand import Demand
+from idm_env.tasks.signals import SignalsTask, World
 
 EPISODES, FRESH, OTHERS = 64, 1 << 20, 1 << 19
 """Episodes that judge, their first seed, and that of episodes on which a rule is searched."""
@@ -102,10 +113,89 @@ def searched(seconds: float, **keywords: Any) -> tuple[np.ndarray, float]:
     return mean, time.process_time() - start
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InSumo(SignalsTask):
+    """The task in one world whose vehicles SUMO drives: what is observed and judged is its state, by the same code."""
+
+    opened: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+    places: dict[str, tuple[int, float]] = field(default_factory=dict)
+    letters: list[list[int]] = field(default_factory=list)
+    text: str = field(default_factory=lambda: generated(GRID))
+
+    def __post_init__(self) -> None:
+        """Find our link, and the way to it on that, of each lane of SUMO's, and our letter of each of a signal's."""
+        super().__post_init__()
+        net, theirs = self.road, network_of(self.text)
+        moves = {theirs.move_name(m): m for m in range(len(theirs.start))}
+        self.places.update({name: (k, 0.0) for k, name in enumerate(net.names) if not net.inner[k]})
+        self.letters.extend([0] * len(plan.states[0]) for plan in net.plans)
+        for m in range(len(net.start)):
+            other = moves[net.move_name(m)]
+            path = theirs.path[other][theirs.path[other] >= 0]
+            ways = np.cumsum([0.0, *theirs.length[path]])
+            self.places.update({theirs.names[k]: (int(net.path[m, 0]), w) for k, w in zip(path, ways, strict=False)})
+            self.letters[net.signal[m]][theirs.index[other]] = int(net.index[m])
+
+    def begin(self, draw: Any) -> World:
+        """Begin SUMO with the episode's vehicles; ``i`` is who has slot i."""
+        world = super().begin(draw)
+        ways, dt = journeys_of(world.state), self.simulator.dt
+        come = (ways.due[0] * dt < self.duration).numpy()
+        demand = Demand(ways.routes.numpy(), ways.route[0].numpy()[come], ways.due[0].numpy()[come] * dt)
+        self.opened.close()
+        options = "--step-method.ballistic", "--collision.action", "none"
+        self.opened.enter_context(started(self.text, routes_xml(self.road, demand), *options, step=dt))
+        return world
+
+    def _drive(self, world: World, phases: np.ndarray, steps: int) -> World:
+        sumo: Any = import_module("libsumo")
+        state, ways, dt = world.state, journeys_of(world.state), self.simulator.dt
+        links = state.lanes
+        assert links is not None
+        lane, hop, left, position, speed = (
+            x[0].numpy().copy() for x in (links.lane, ways.hop, ways.left, state.position, state.speed)
+        )
+        begin, second = int(state.step.reshape(-1)[0]), round(1.0 / dt)
+        for step in range(begin, begin + steps):
+            if step % second == 0 or step == begin:
+                self._show(sumo, phases[0], step * dt)
+            sumo.simulationStep()
+            left[[int(name) for name in sumo.simulation.getArrivedIDList()]] = step + 1
+        on = np.zeros(len(lane), bool)
+        for name in sumo.vehicle.getIDList():
+            link, way = self.places[sumo.vehicle.getLaneID(name)]
+            i = int(name)
+            hop[i] += int(np.argmax(ways.routes[ways.route[0, i], hop[i] :].numpy() == link))
+            on[i], lane[i] = True, link
+            position[i], speed[i] = way + sumo.vehicle.getLanePosition(name), sumo.vehicle.getSpeed(name)
+        entered = np.where((on | (left >= 0)) & (ways.entered[0].numpy() < 0), begin + steps, ways.entered[0].numpy())
+        rows = {k: torch.from_numpy(x)[None] for k, x in (("hop", hop), ("left", left), ("entered", entered))}
+        links = links._replace(lane=torch.from_numpy(lane)[None], journeys=ways._replace(**rows))
+        moved = {k: torch.from_numpy(x)[None] for k, x in (("position", position), ("speed", speed))}
+        present = torch.from_numpy(on)[None].to(state.speed.dtype)
+        return world._replace(state=state._replace(**moved, present=present, lanes=links, step=state.step + steps))
+
+    def _show(self, sumo: Any, phases: np.ndarray, now: float) -> None:
+        """Show SUMO's signals the states of these rows of their plans, −1 for what the plan says now (s)."""
+        for s, phase in zip(self.agents, phases, strict=True):
+            plan = self.road.plans[s]
+            if phase < 0:
+                ends = np.cumsum(plan.durations)
+                phase = np.searchsorted(ends, (now - plan.offset) % ends[-1], side="right")
+            sumo.trafficlight.setRedYellowGreenState(plan.name, "".join(plan.states[phase][i] for i in self.letters[s]))
+
+
+def in_sumo(episodes: int, policy: Policy, keywords: dict[str, Any]) -> np.ndarray:
+    """Return the delay per vehicle of that many episodes inside SUMO (s)."""
+    env, task = made(1, **keywords), InSumo(**keywords)
+    env.task = env.worlds.task = task
+    with task.opened:
+        return np.concatenate([delays(env, policy, FRESH + i) for i in range(episodes)])
+
+
 def trained(seed: int, steps: int, **keywords: Any) -> tuple[Policy, float]:
     """Return PPO's last policy, one for all signals, and the CPU time of its training (s)."""
     import stable_baselines3
-    import torch
     from stable_baselines3.common.vec_env import VecNormalize
 
     from idm_env.envs.sb3 import SB3VecEnv
@@ -127,7 +217,7 @@ def trained(seed: int, steps: int, **keywords: Any) -> tuple[Policy, float]:
 
 def main(
     inflow: float = 300.0, network: str = "grid 5x5", search_seconds: float = 30.0, steps: int = 1_000_000,
-    seeds: int = 5, episodes: int = EPISODES,
+    seeds: int = 5, episodes: int = EPISODES, sumo: int = 0,
 ) -> None:  # fmt: skip
     """Delay per vehicle of rules and of PPO, on the same fresh episodes."""
     keywords: dict[str, Any] = {"network": network, "inflow": inflow}
@@ -156,18 +246,19 @@ def main(
     for name, policy, seconds, more in rows:
         each = delays(made(episodes, **{**keywords, **more}), policy, FRESH)
         other = each if other is None else other
-        apart = each - other
-        cells.append(
-            (
-                name,
-                f"{each.mean():.1f}",
-                f"{apart.mean():+.1f} ± {1.96 * apart.std(ddof=1) / len(apart) ** 0.5:.1f}",
-                f"{seconds:.0f}",
-            )
-        )
+        cells.append([name, f"{each.mean():.1f}", interval(each - other), f"{seconds:.0f}"])
+        if sumo:
+            theirs = in_sumo(sumo, policy, {**keywords, **more})
+            cells[-1] += [f"{theirs.mean():.1f}", interval(theirs - each[:sumo])]
         print(*cells[-1], flush=True)
     print()
-    print(table(("", "delay (s)", "beside max pressure 10", "CPU s"), cells))
+    head = ["", "delay (s)", "beside max pressure 10", "CPU s"]
+    print(table(head + ["in SUMO", "less ours"] * bool(sumo), cells))
+
+
+def interval(x: np.ndarray) -> str:
+    """Return a mean of differences with its interval of 95 %."""
+    return f"{x.mean():+.1f} ± {1.96 * x.std(ddof=1) / len(x) ** 0.5:.1f}"
 
 
 if __name__ == "__main__":
