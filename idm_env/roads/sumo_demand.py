@@ -64,6 +64,7 @@ class _Reader:
         self.known: dict[str, dict[str, list[tuple[float, Any]]]] = {"vType": {}, "route": {}}
         self.numbers: dict[Route, int] = {}
         self.rows: list[tuple[int, float, float, float, int]] = []
+        self.ids: set[str] = set()
 
     def add(self, element: Element) -> None:
         """Take one element; what is neither traffic of cars nor said of it is counted."""
@@ -134,11 +135,14 @@ class _Reader:
     def _add_vehicles(self, element: Element) -> None:
         """Add the rows of a vehicle, a trip or a flow."""
         self._count_unread(element)
+        if (own := text(element, "id")) in self.ids:
+            raise ValueError(f"{name(element)}: this id was given before. Give each vehicle, trip and flow its own.")
+        self.ids.add(own)
         key = element.get("type", "DEFAULT_VEHTYPE")
         if key == "DEFAULT_VEHTYPE" and key not in self.known["vType"]:
             self._choices(Element("vType", id=key), "vType")
         types, routes = self._named("vType", key, element), self._routes_of(element)
-        random = keyed(self.seed, text(element, "id"))
+        random = keyed(self.seed, own)
         for depart in self._departures(element, random) if routes else ():
             one, route = _choose(types, random), _choose(routes, random)
             if one is None:

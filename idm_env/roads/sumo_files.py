@@ -70,10 +70,10 @@ def _bounded(value: float, low: float, above: bool) -> float:
 
 
 def seconds(element: Element, key: str, default: float | None = None) -> float:
-    """Return a time (s), of seconds or ``[days:]hours:minutes:seconds``; ValueError for any other."""
+    """Return a time from 0 on (s), of seconds or ``[days:]hours:minutes:seconds``; ValueError for any other."""
     value = element.get(key, "")
     if not re.fullmatch(r"(\d+:)?\d+:\d+:\d+(\.\d*)?", value):
-        return number(element, key, default)
+        return number(element, key, default, 0.0)
     total = 0.0
     for part, factor in zip(reversed(value.split(":")), (1.0, 60.0, 3600.0, 86400.0), strict=False):
         total += factor * float(part)
