@@ -137,7 +137,7 @@ def gather(
         signals=np.ascontiguousarray(np.concatenate(pieces)),
         bounds=bounds,
         first=bounds[:-1] + np.array([len(h) for h in before]),
-        length=samples.length[:, VEHICLES.index("driver")],
+        length=samples.length[:, VEHICLES.index("driver")].copy(),  # a loop is compiled for each layout
         group=group.numpy(),
         groups=groups,
         run=np.array([runs.index(e.run_id) for e in episodes]),

@@ -86,7 +86,7 @@ class Problem:
         if values.ndim == 2:
             values = np.broadcast_to(values[:, None], (len(theta), self.groups, values.shape[-1]))
         catalogue, on = model.catalogue, model.on
-        phi = np.ascontiguousarray(model.phi(values))
+        phi = np.require(model.phi(values), requirements=["C", "W"])  # a loop is compiled for each layout
         pulse = np.zeros((0, 4)) if pulse is None else march.pulsed(catalogue, pulse, on, phi)
         return march.loop(catalogue, self.rows.records.dt).roll(self.rows, np.exp(theta), phi, on, model.tables, pulse)
 

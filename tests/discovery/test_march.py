@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from idm_env.compiled.kernels import threads
+from idm_env.compiled.scalar import library
 from idm_env.discovery import march, model as terms
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.march import Catalogue
@@ -179,6 +180,20 @@ def test_a_printed_loop_depends_on_no_number() -> None:
     """Neither the time step nor the length of a lap makes another text, which would be compiled again."""
     texts = {march.loop(Catalogue.of((), lap), dt).text for lap, dt in ((230.0, 0.1), (231.5, 0.1), (230.0, 0.04))}
     assert len(texts) == 1 and march.loop(Catalogue.of(), 0.1).text not in texts
+
+
+def test_a_loop_is_compiled_once_whatever_its_arrays_are_views_of(platoon: Records) -> None:
+    """Drivers of records and of some of them, parameters that vary and those that stand."""
+    drag, values = Hypothesis((terms.simple("drag"),)), np.array([6e-4])
+    for records in (platoon, platoon.some(np.arange(len(platoon.first)) > 2)):
+        rows = whole(records)
+        problem, theta = Problem(rows, None, first_prior()), np.tile(THETA, (1, len(records.groups), 1))
+        problem.predict(theta, Hypothesis(), np.zeros((1, 0)))
+        problem.predict(theta, drag, values[None])
+        problem.predict(theta, drag.fixed(values), np.zeros((1, 0)))
+    for catalogue in (drag.catalogue, drag.bare.catalogue):
+        compiled = library.load("march", march.loop(catalogue, platoon.dt).text).march
+        assert len(compiled.signatures) == 1, compiled.signatures
 
 
 def test_what_has_no_name_ends_with_the_states_that_were_seen() -> None:
