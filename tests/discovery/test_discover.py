@@ -94,7 +94,8 @@ def test_the_only_candidate_may_become_every_drivers_own_strength() -> None:
 
 
 def test_followers_are_counted_where_runs_are_few() -> None:
-    found = discover(data("leader_acceleration", runs=5, followers=3), effects=FEW)
+    """One candidate alone may be asked for: the round after its addition has nothing left to try."""
+    found = discover(data("leader_acceleration", runs=5, followers=3), effects=["leader_acceleration"])
     assert [f["effect"] for f in found.report["found"]] == ["leader_acceleration"]
     assert found.report["found"][0]["p_value"] < 2.0**-4
     faint = discover(data("leader_acceleration", runs=4, ou=0.3), effects=FEW).report
@@ -115,12 +116,6 @@ def test_a_report_is_drawn_at_every_time_step(dt: float, tmp_path: Path) -> None
     """Windows are of whole samples of about half a second, and not of whole seconds at every step."""
     found = discover(data(None, runs=7, followers=1, seconds=30.0, dt=dt), effects=["drag"])
     assert write_report(found, tmp_path)["report.html"].exists()
-
-
-def test_one_candidate_alone_may_be_asked_for() -> None:
-    """The round after its addition has nothing left to try."""
-    found = discover(data("leader_acceleration"), effects=["leader_acceleration"])
-    assert [f["effect"] for f in found.report["found"]] == ["leader_acceleration"]
 
 
 def test_candidates_that_cannot_be_tried_are_named() -> None:

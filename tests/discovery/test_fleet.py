@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 
 from idm_env.data import synthetic
-from idm_env.discovery import discover, fleet, write_report
+from idm_env.discovery import bases, discover, fleet, write_report
 from idm_env.discovery.bases import Law
 from idm_env.discovery.fleet import Among
 from idm_env.discovery.judge import Judged
@@ -83,8 +83,11 @@ def test_kinds_are_told_where_there_are_some_and_hardly_ever_elsewhere(
 
 
 @pytest.mark.parametrize("column", ["acc_run", ""])
-def test_a_mixed_file_has_a_law_for_each_kind_of_driver(column: str, kinds: Mixing, tmp_path: Path) -> None:
+def test_a_mixed_file_has_a_law_for_each_kind_of_driver(
+    column: str, kinds: Mixing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Every second driver is a linear controller; what each kind follows is said first, and each has a model."""
+    monkeypatch.setattr(bases, "BASES", ("idm", "constant_time_gap"))  # all are compared in test_bases.py
     linear = np.add.outer(np.arange(8), np.arange(2)) % 2 == 1
     kinds(linear)
     made, _ = synthetic.generate(31, runs=8, followers=2, seconds=90.0)

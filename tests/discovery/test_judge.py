@@ -90,9 +90,10 @@ def test_a_driver_whose_fit_stops_in_a_corner_begins_anew(kinds: Mixing) -> None
     assert judge.judge(records, model, np.zeros(0), theta).gap_rmse.max() < 0.3
 
 
-@pytest.mark.parametrize("every", [10, 20])
-def test_data_of_one_and_half_a_sample_a_second_are_judged(every: int) -> None:
-    """Windows hold at least two steps, and a second at least one."""
+@pytest.mark.usefixtures("two_laws")
+@pytest.mark.parametrize("every", [11, 20])
+def test_data_of_less_than_a_sample_a_second_are_judged(every: int) -> None:
+    """Windows hold at least two steps, and a second at least one. Whole seconds have loops of their own."""
     made, _ = synthetic.generate(4, runs=3, followers=2, seconds=120.0)
     some = made.table.filter((pl.col("time_s") * 10.0).round().cast(pl.Int64) % every == 0)
     found = discover(Trajectories.from_frame(some), effects=["drag"])
