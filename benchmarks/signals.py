@@ -119,22 +119,19 @@ class InSumo(SignalsTask):
 
     opened: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     places: dict[str, tuple[int, float]] = field(default_factory=dict)
-    letters: list[list[int]] = field(default_factory=list)
     text: str = field(default_factory=lambda: generated(GRID))
 
     def __post_init__(self) -> None:
-        """Find our link, and the way to it on that, of each lane of SUMO's, and our letter of each of a signal's."""
+        """Find our link, and the way to it on that, of each lane of SUMO's; signals' letters are the same."""
         super().__post_init__()
         net, theirs = self.road, network_of(self.text)
         moves = {theirs.move_name(m): m for m in range(len(theirs.start))}
         self.places.update({name: (k, 0.0) for k, name in enumerate(net.names) if not net.inner[k]})
-        self.letters.extend([0] * len(plan.states[0]) for plan in net.plans)
         for m in range(len(net.start)):
             other = moves[net.move_name(m)]
             path = theirs.path[other][theirs.path[other] >= 0]
             ways = np.cumsum([0.0, *theirs.length[path]])
             self.places.update({theirs.names[k]: (int(net.path[m, 0]), w) for k, w in zip(path, ways, strict=False)})
-            self.letters[net.signal[m]][theirs.index[other]] = int(net.index[m])
 
     def begin(self, draw: Any) -> World:
         """Begin SUMO with the episode's vehicles; ``i`` is who has slot i."""
@@ -182,7 +179,7 @@ class InSumo(SignalsTask):
             if phase < 0:
                 ends = np.cumsum(plan.durations)
                 phase = np.searchsorted(ends, (now - plan.offset) % ends[-1], side="right")
-            sumo.trafficlight.setRedYellowGreenState(plan.name, "".join(plan.states[phase][i] for i in self.letters[s]))
+            sumo.trafficlight.setRedYellowGreenState(plan.name, plan.states[phase])
 
 
 def in_sumo(episodes: int, policy: Policy, keywords: dict[str, Any]) -> np.ndarray:

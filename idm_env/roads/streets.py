@@ -159,7 +159,7 @@ def grid(rows: int, columns: int, block: float, arm: float, limit: float, contro
         validation.in_interval(key, float(value), 2.0 * RADIUS + 5.0, 1e5, "m")
     streets = Streets(limit, control)
     nodes = {f"{chr(65 + i)}{j}": (arm + i * block, arm + j * block) for i in range(columns) for j in range(rows)}
-    arms: dict[str, list[tuple[str, int]]] = {name: [] for name in nodes}
+    arms: dict[str, list[tuple[int, str]]] = {name: [] for name in nodes}
     pairs = [(f"left{j}", f"A{j}") for j in range(rows)] + [(f"bottom{i}", f"{chr(65 + i)}0") for i in range(columns)]
     pairs += [(a, b) for a in nodes for b in (f"{chr(ord(a[0]) + 1)}{a[1:]}", f"{a[0]}{int(a[1:]) + 1}") if b in nodes]
     pairs += [(f"{chr(64 + columns)}{j}", f"right{j}") for j in range(rows)]
@@ -169,11 +169,12 @@ def grid(rows: int, columns: int, block: float, arm: float, limit: float, contro
         step = np.array([0.0, 1.0] if upright else [1.0, 0.0])
         ends = nodes.get(a) or tuple(nodes[b] - arm * step), nodes.get(b) or tuple(nodes[a] + arm * step)
         streets.add_street((f"{a}{b}", f"{b}{a}"), ends, (RADIUS * (a in nodes), RADIUS * (b in nodes)))
-        for name, neighbour in ((a, b), (b, a)):
+        for name, neighbour, side in ((a, b, 1 - upright), (b, a, 3 - upright)):
             if name in nodes:
-                arms[name].append((neighbour, int(upright)))
-    for name, roads in arms.items():
-        streets.join(name, {(f"{a}{name}", f"{name}{b}"): (up, 1 - up) for a, up in roads for b, _ in roads if a != b})
+                arms[name].append((side, neighbour))
+    for name, roads in arms.items():  # clockwise from the north, from each the right turn first
+        ways = [(i, a, b) for i, a in sorted(roads) for j, b in sorted(roads, key=lambda x: (i - x[0]) % 4) if i != j]
+        streets.join(name, {(f"{a}{name}", f"{name}{b}"): (1 - i % 2, i % 2) for i, a, b in ways})
     return streets
 
 

@@ -178,9 +178,9 @@ class SignalsTask:
 
     @cached_property
     def lanes(self) -> tuple[Array, ...]:
-        """The links that lead to each agent."""
-        net = self.road
-        return tuple(np.unique(net.start[net.signal == s]) for s in self.agents)
+        """The links that lead to each agent, in the order of their letters: a phase's string says which of them go."""
+        net, moves = self.road, (np.flatnonzero(self.road.signal == s) for s in self.agents)
+        return tuple(np.array(list(dict.fromkeys(net.start[m[np.argsort(net.index[m])]].tolist()))) for m in moves)
 
     @cached_property
     def _of_link(self) -> tuple[Array, Array]:

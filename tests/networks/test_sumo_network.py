@@ -106,7 +106,7 @@ LANE = 'length="192.8" speed="13.89"'
         (LANE, 'length="192.8" speed="0"', "link 'left0A0_0': limit = 0 m/s must be above 0"),
         (LANE, 'length="far" speed="13.89"', "<lane id=\"left0A0_0\">: length = 'far' must be a number"),
         (LANE, 'speed="13.89"', '<lane id="left0A0_0"> has no length'),
-        ('state="rrr', 'state="', "signal 'A0': state 'gGGrrrGGg' has 9 letters, and move"),
+        ('state="rrr', 'state="', "signal 'A0': state 'GGgrrrGGg' has 9 letters, and move"),
         ('state="rrr', 'state="rrX', "signal 'A0': letter 'X' of a state is unknown"),
         ('duration="42.0"', 'duration="0"', "signal 'A0': durations"),
         ('<tlLogic id="A0"', '<tlLogic id="B"', 'tl="A0" has no tlLogic'),
