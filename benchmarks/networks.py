@@ -78,7 +78,8 @@ def routes_xml(network: Network, demand: Demand) -> str:
 
 
 def simulator(network: Network, **rules: float) -> tuple[Simulator, Any]:
-    """Return our simulator, and its parameters."""
+    """Return our simulator, and its parameters: at amber SUMO's drivers stop where their own b is enough."""
+    rules = {"most_decel": DRIVER["comfort_decel"], **rules}
     cars = Simulator(network, (IDM(), StopLine(**rules), LinkLimit(), Brakes()), dt=DT)
     params: Any = cars.defaults()
     numbers = {**DRIVER, "desired_speed": TOP}

@@ -53,8 +53,9 @@ class StopLine(Effect):
 
     Where his next line is, and whether it is closed to him, a driver on a network is told ``every`` so many seconds
     (``multilane.junctions``): it is his memory (m on his link). It is closed for red and amber, if he can stop, ``v² ≤
-    2 b_m s_line``; while a foe is inside or has reserved; without room behind the junction; and to drivers who yield
-    while they are more than ``sight`` (m) away, or somebody with priority arrives within t_c (``critical_gap``, s).
+    2 b_m s_line``, and did not wait there for a gap in green; while a foe is inside or has reserved; without room
+    behind the junction; and to drivers who yield while they are more than ``sight`` (m) away, or somebody with
+    priority arrives within t_c (``critical_gap``, s).
     Lines and leaders are looked for within ``reach`` (m), or v²/2b_m if that is more.
     """
 

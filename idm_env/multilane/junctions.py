@@ -163,12 +163,12 @@ def travelling(
         present=tensor(begun),
     )  # fmt: skip
     assert state.lanes is not None
-    no, whole = torch.zeros(shape, dtype=torch.bool), torch.int32
+    whole = torch.int32
     due, asks = np.where(begun, 0, due), column([d.speed for d in many], 0.0, float)
     ways = Journeys(
-        torch.from_numpy(table), tensor(route, whole), tensor(np.maximum(hops, 0), whole), no, no.clone(),
-        tensor(due, whole), tensor(asks), tensor(np.where(begun, 0, -1), whole), tensor(-1, whole),
-        torch.full((*shape[:-1], len(network.plans)), -1, dtype=whole),
+        torch.from_numpy(table), tensor(route, whole), tensor(np.maximum(hops, 0), whole), tensor(0, whole),
+        tensor(0, torch.bool), tensor(due, whole), tensor(asks), tensor(np.where(begun, 0, -1), whole),
+        tensor(-1, whole), torch.full((*shape[:-1], len(network.plans)), -1, dtype=whole),
     )  # fmt: skip
     return state._replace(lanes=state.lanes._replace(journeys=ways))
 

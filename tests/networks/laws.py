@@ -94,7 +94,7 @@ def _met(network: Network, part: Part, shape: tuple[int, ...]) -> list[str]:
 def _crossed(simulator: Simulator, before: State, after: State) -> list[str]:
     """Return who has begun to cross in red or amber although he could have stopped.
 
-    Whoever yields, and has come to the line for that, may pass in amber.
+    Whoever waited for a gap in green counts as inside (``told`` 2), and clears the junction.
     """
     network, ways, was = simulator.road, journeys_of(after), journeys_of(before)
     assert isinstance(network, Network) and before.present is not None
@@ -104,8 +104,8 @@ def _crossed(simulator: Simulator, before: State, after: State) -> list[str]:
     link, ahead = (route[np.arange(len(row)), k] for k in (hop, hop + 1))
     position, speed = (x.double().numpy()[row, i] for x in (before.position, before.speed))
     room, move = network.length[link] - position, network.move_of[ahead]
-    lights, waits = shown(network, int(before.step) * simulator.dt)[move], network.yields[move, 0] >= 0
-    wrong = (lights == RED) | (lights == AMBER) & ~(waits & (room < rules.sight))
+    lights, stops = shown(network, int(before.step) * simulator.dt)[move], was.told.numpy()[row, i] < 2
+    wrong = ((lights == RED) | (lights == AMBER)) & stops
     wrong &= (move >= 0) & (network.path[move, 0] == ahead) & (speed * speed < 2.0 * rules.most_decel * room - 1e-3)
     return [
         f"row {row[k]}: {i[k]} passed {network.move_name(move[k])} in red, at {speed[k]:.1f} m/s and {room[k]:.1f} m"

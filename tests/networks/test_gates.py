@@ -13,9 +13,10 @@ import torch
 from idm_env import IDM, Brakes, Simulator
 from idm_env.backends import off
 from idm_env.effects import LinkLimit, Noise, StopLine
-from idm_env.multilane.junctions import by_link, counts, deadlocked, showing, travelling
-from idm_env.roads.network import Network, Plan
+from idm_env.multilane.junctions import by_link, counts, deadlocked, journeys_of, showing, travelling
+from idm_env.roads.network import Network, Plan, padded
 from idm_env.roads.network_demand import Demand
+from idm_env.roads.ways import Ways
 from idm_env.types import State
 from tests.networks.laws import broken
 
@@ -88,6 +89,22 @@ def test_as_many_pass_in_a_green_as_in_sumo(green: float, vehicles: int) -> None
         assert state.lanes is not None and state.present is not None
         passed.append(int(counts(state).left) + int((state.lanes.lane[state.present > 0] > 0).sum()))
     assert np.diff(passed)[2:].tolist() == [vehicles] * 4
+
+
+def test_one_turns_left_after_each_green() -> None:
+    """Oncoming traffic leaves no gap. SUMO lets 1.0 a cycle clear the junction when it has ended."""
+    network = Network.crossing(arm=300.0)
+    simulator, params = simulated(network, **SUMO)
+    ways, n = Ways(network), 400
+    routes = [ways.route_along(way, "") for way in (["bottom0A0", "A0left0"], ["top0A0", "A0bottom0"])]
+    demand = Demand(padded(routes), [0, 1] * n, np.repeat(np.arange(n) * 1.5, 2))
+    state = travelling(simulator, demand, params, dtype=torch.float64)
+    cleared = list[int]()
+    for _ in range(6):
+        state, _ = simulator.rollout(state, {}, params, 900, keep=None)
+        journeys = journeys_of(state)
+        cleared.append(int(((journeys.left >= 0) & (journeys.route == 0)).sum()))
+    assert np.diff(cleared)[1:].tolist() == [1] * 4
 
 
 @pytest.mark.parametrize(("seed", "signals"), [(0, True), (1, False), (2, True), (3, False)])

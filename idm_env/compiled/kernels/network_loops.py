@@ -44,6 +44,8 @@ W, K = 16, 8
 pointers: numba counts references to arrays at every call, which costs more than most of what is done here."""
 NONE = -1
 RED, GREEN, AMBER, YIELD = range(4)
+FREE, STOPS, CLEARS = range(3)
+"""What a driver is told: nothing; to stop; and that he counts as inside, so that in red he goes before his foes."""
 FAR, OPEN = 1e4, 1e6
 STANDS = 1.0
 """Speed below which whoever is behind a junction may not make room in time (m/s)."""
@@ -139,7 +141,7 @@ def travel(step, anew, sizes, car, tag, road, site, move, routes):
             if k < 0:
                 break
             if site[K * k + OPENS] >= 0:
-                tag[W * i + TOLD], tag[W * i + RESERVED] = 0, 0
+                tag[W * i + TOLD], tag[W * i + RESERVED] = FREE, 0
         car[W * i + MOVED], tag[W * i + NEW] = 0, SAME
         if k < 0:
             tag[W * i + LEFT], tag[W * i + LEADER], tag[W * i + FOLLOWER] = step, i, i
@@ -230,7 +232,7 @@ def enter(step, n, sizes, car, tag, road, site, move, routes, rules, driver):
             min(car[W * i + ENTERING], car[W * j + SPEED]) if kind == CAME_BEHIND else car[W * i + ENTERING]
         )
         car[W * i + ACCEL], car[W * i + PRESENT], tag[W * i + ENTERED], tag[W * i + LEADER] = 0, 1, step, i
-        tag[W * i + TOLD], tag[W * i + RESERVED], car[W * i + MOVED], tag[W * i + NEW] = 0, 0, 0, kind
+        tag[W * i + TOLD], tag[W * i + RESERVED], car[W * i + MOVED], tag[W * i + NEW] = FREE, 0, 0, kind
         tag[W * n + HERE] = i
         n += 1
         put_on_link(i, sizes[WIDE], car, tag, road, site, move, routes)
@@ -316,10 +318,17 @@ def guard(n, sizes, car, tag, road, site, move, against, routes, rules, driver):
 
 
 @exact
+def is_closed(m, move):
+    """Whether a move is shown red or amber."""
+    return move[K * m + SHOWN] == RED or move[K * m + SHOWN] == AMBER
+
+
+@exact
 def look_ahead(i, sizes, car, tag, road, site, move, routes, rules, driver):
     """Note whether a vehicle is about to arrive; what he has reserved ends where it is closed and he can stop.
 
-    Nobody arrives behind somebody who stands before the line, or who stands because he cannot leave the junction.
+    Nobody arrives behind somebody who stands before the line, or who stands because he cannot leave the junction. In
+    amber and red those alone arrive who count as inside.
     Before a link of a lower limit he brakes as before a closed line, until he is as slow.
     """
     v, k, m, room = car[W * i + SPEED], tag[W * i + LINK], tag[W * i + GATE], car[W * i + LINE] - car[W * i + POSITION]
@@ -330,14 +339,11 @@ def look_ahead(i, sizes, car, tag, road, site, move, routes, rules, driver):
     j = tag[W * i + LEADER]
     stuck = j != i and car[W * j + SPEED] < STANDS and car[W * i + BASE] + car[W * j + POSITION] < car[W * i + LINE]
     near = room < rules[CRITICAL_GAP] * max(v, STANDS) and not stuck
-    if near and (v >= STANDS or has_room(i, m, sizes, car, tag, road, site, move, routes, driver)):
+    ends = tag[W * i + TOLD] < CLEARS and is_closed(m, move)
+    if near and not ends and (v >= STANDS or has_room(i, m, sizes, car, tag, road, site, move, routes, driver)):
         move[K * m + COMING] = i + 1
-    if (
-        tag[W * i + RESERVED]
-        and (move[K * m + SHOWN] == RED or move[K * m + SHOWN] == AMBER)
-        and v * v * rules[BRAKING] <= room
-    ):
-        tag[W * i + TOLD] = 1
+    if ends and tag[W * i + RESERVED] and v * v * rules[BRAKING] <= room:
+        tag[W * i + TOLD] = STOPS
         reserve(i, m, -1, car, tag, road, move)
 
 
@@ -365,9 +371,10 @@ def passes(i, m, sizes, car, tag, road, site, move, against, routes, rules, driv
     if room >= max(rules[REACH], v * v * rules[BRAKING]):
         return False
     if is_shut(i, m, room, sizes, car, tag, road, site, move, against, routes, rules, driver):
-        car[W * i + STOP], tag[W * i + TOLD] = car[W * i + LINE], 1
+        car[W * i + STOP], tag[W * i + TOLD] = car[W * i + LINE], max(tag[W * i + TOLD], STOPS)
         return False
-    tag[W * i + TOLD] = 0
+    if tag[W * i + TOLD] == STOPS:
+        tag[W * i + TOLD] = FREE
     if room > v * v * rules[BRAKING] + v * every + rules[MORE]:  # how far he may come until the next event
         return False
     reserve(i, m, 1, car, tag, road, move)
@@ -378,25 +385,31 @@ def passes(i, m, sizes, car, tag, road, site, move, against, routes, rules, driv
 def is_shut(i, m, room, sizes, car, tag, road, site, move, against, routes, rules, driver):
     """Whether a gate is shut to a vehicle that is ``room`` (m) before its line.
 
-    Who yields comes as near as he can stop within sight of the line, and if he has waited there passes in amber.
+    Who yields comes as near as he can stop within sight of the line. If he is refused there he counts as inside, as in
+    SUMO: in amber and red he goes once no foe is inside, and foes wait for him.
     """
     square, yields = car[W * i + SPEED] * car[W * i + SPEED], against[(sizes[MOVES] + m) * sizes[AGAINST]] >= 0
-    can_stop = tag[W * i + TOLD] == 1 or square * rules[BRAKING] <= room
-    waits = yields and tag[W * i + TOLD] == 1 and room < rules[SIGHT]
-    if can_stop and (move[K * m + SHOWN] == RED or (move[K * m + SHOWN] == AMBER and not waits)):
+    can_stop, clears = tag[W * i + TOLD] > FREE or square * rules[BRAKING] <= room, tag[W * i + TOLD] == CLEARS
+    closed = is_closed(m, move)
+    if can_stop and closed and not clears:
         return True
+    if yields and move[K * m + SHOWN] == YIELD and tag[W * i + TOLD] == STOPS and room < rules[SIGHT]:
+        tag[W * i + TOLD] = CLEARS
     for q in range(sizes[AGAINST]):
         f = against[m * sizes[AGAINST] + q]
         if f >= 0 and move[K * f + INSIDE] > 0:
             tag[W * i + WAITS] = move[K * f + HOLDER]
             return True
-    if move[K * m + SHOWN] != GREEN and yields:
+        if f >= 0 and not clears and move[K * f + COMING] > 0 and is_closed(f, move):
+            tag[W * i + WAITS] = move[K * f + COMING] - 1
+            return True
+    if move[K * m + SHOWN] == YIELD and yields:
         brake = driver[BRAKE * sizes[EACH] + (i if sizes[EACH] > 1 else 0)]
         if room > rules[SIGHT] and can_stop and square > 2 * brake * rules[SIGHT]:
             return True
         for q in range(sizes[AGAINST]):
             f = against[(sizes[MOVES] + m) * sizes[AGAINST] + q]
-            if f >= 0 and move[K * f + SHOWN] != RED and move[K * f + SHOWN] != AMBER and move[K * f + COMING] > 0:
+            if f >= 0 and move[K * f + COMING] > 0 and not is_closed(f, move):
                 tag[W * i + WAITS] = move[K * f + COMING] - 1
                 return True
     return (

@@ -46,7 +46,7 @@ STATE_CAR, STATE_TAG = CAR.index("limit") + 1, TAG.index("left") + 1
 MOVING = ("position", "speed", "accel", "gap")
 """What steps change."""
 
-KINDS = {"told": torch.bool, "reserved": torch.bool} | dict.fromkeys(("link", "leader", "follower"), torch.int64)
+KINDS = {"reserved": torch.bool} | dict.fromkeys(("link", "leader", "follower"), torch.int64)
 """Whole numbers that a state has in another form."""
 
 
