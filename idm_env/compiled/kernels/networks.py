@@ -8,7 +8,6 @@ Shapes: what belongs to vehicles is ``[..., n]``, in SI units.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -23,13 +22,13 @@ from idm_env.compiled.kernels.network_loops import CAR, TAG, K, W
 from idm_env.compiled.kernels.network_rows import LEADS, LED, Operands
 from idm_env.compiled.kernels.operands import operand, table
 from idm_env.compiled.kernels.printed import TileKernel, tile_kernel
-from idm_env.compiled.kernels.several import _cut, _placed, _row
+from idm_env.compiled.kernels.several import _cut, _placed, _row, between
 from idm_env.compiled.kernels.tiles import Array
 from idm_env.compiled.kernels.workspace import take
 from idm_env.compiled.scalar.record import Form
 from idm_env.multilane import before
 from idm_env.multilane.junctions import Event, every, guided, rules_of
-from idm_env.roads.chains import Chains, Places
+from idm_env.roads.chains import Places
 from idm_env.roads.network import Network
 from idm_env.types import Inputs, Params, State
 
@@ -163,19 +162,11 @@ def event(stepping: CarFollowingStep, state: State, params: Params, now: Tensor)
 # -- rollouts --------------------------------------------------------------------------------------------------------
 
 
-def inner_of(simulator: Simulator) -> Simulator:
-    """Return the simulator of the steps between two events, made once."""
-    inner: Simulator | None = simulator.__dict__.get("_between")
-    if inner is None:
-        inner = simulator.__dict__["_between"] = dataclasses.replace(simulator, road=Chains(False))
-    return inner
-
-
 def kernel_of(simulator: Simulator, state: State, inputs: Inputs) -> TileKernel | str:
     """Return the kernel of the steps between two events, or why there is none."""
     if state.lanes is None or state.lanes.journeys is None:
         return "nobody has a route"
-    kernel = tile_kernel(inner_of(simulator), Form.of(state._replace(lanes=None), inputs))
+    kernel = tile_kernel(between(simulator), Form.of(state._replace(lanes=None), inputs))
     if not isinstance(kernel, str) and "leads" in (*kernel.program.statics, *kernel.program.states):
         return "an effect looks back, and on networks several vehicles may be behind one"
     return kernel
@@ -188,7 +179,7 @@ def rollout(
     plain = not keep and not kernel.signals and not kernel.flags and not _differentiated(kernel, state, inputs, params)
     if plain and set(state.memory) <= {effect.name for effect in guided(simulator).values()}:
         return _in_place(kernel, simulator, state, inputs, params, steps), None
-    inner, after = inner_of(simulator), every(simulator)
+    inner, after = between(simulator), every(simulator)
     motions: list[tuple[Tensor, ...]] = []
     done, clocks = 0, clocks_of(state)
     while done < steps:
@@ -309,7 +300,7 @@ def _plan(
         if name in kernel.numbers:
             array, by = operand(lanes.part_of(inputs, name), batch, n, steps)
         else:
-            x = torch.ones(()) if name == "present" else lanes.static_of(inner_of(simulator), state, params, name)
+            x = torch.ones(()) if name == "present" else lanes.static_of(between(simulator), state, params, name)
             array, by = operand(x.to(state.speed.dtype), batch, n)
         held.append(array)
         places.append(int(addresses([array])[0]))

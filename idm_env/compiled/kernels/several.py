@@ -34,10 +34,11 @@ def between(simulator: Simulator) -> Simulator:
     """Return the simulator of the steps between two decisions, made once."""
     inner: Simulator | None = simulator.__dict__.get("_between")
     if inner is None:
-        assert isinstance(simulator.road, Lanes)
         effects = (Remembering(e) if e.hook == "change" else e for e in simulator.effects)
         still = tuple(e for e in effects if not isinstance(e, Remembering) or e.of.remembers)
-        inner = dataclasses.replace(simulator, road=Chains(simulator.road.closed), effects=still)
+        inner = dataclasses.replace(
+            simulator, road=Chains(isinstance(simulator.road, Lanes) and simulator.road.closed), effects=still
+        )
         simulator.__dict__["_between"] = inner
     return inner
 
