@@ -133,6 +133,11 @@ class _Reader:
                     if mine is not None and lane in owner:  # not of pedestrians, bicycles or trains
                         foes[mine] += [owner[lane]] * (foe == "1")
                         yields[mine] += [owner[lane]] * (first == "1" and not self.connections[mine][-1])
+        for one, against in enumerate(foes):  # netgenerate also writes foes of which one alone knows
+            for other in against:
+                if one not in foes[other]:
+                    foes[other].append(one)
+                    self.skipped["foes made mutual"] += 1
         merging: dict[str, list[int]] = {}
         for one, end in enumerate(ends):  # an unregulated junction has no foes
             for other in merging.setdefault(end, []):

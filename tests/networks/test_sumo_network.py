@@ -68,6 +68,18 @@ def test_what_is_written_is_read(network: Network, tmp_path_factory: pytest.Temp
     same(Network.from_sumo(path), network)
 
 
+def test_foes_of_which_one_alone_knows_are_mutual(tmp_path: Path) -> None:
+    """As netgenerate --rand writes some junctions: the network is that of mutual foes, and this is counted."""
+    network, path = Network.crossing(control="priority"), tmp_path / "a.net.xml"
+    foes = re.findall(r' foes="([01]+)"', net_xml(network))
+    last = foes[1].rindex("1")
+    once = foes[1][:last] + "0" + foes[1][last + 1 :]
+    path.write_text(net_xml(network).replace(f' foes="{foes[1]}"', f' foes="{once}"', 1))
+    read = Network.from_sumo(path)
+    same(read, network)
+    assert read.skipped == {"foes made mutual": 1}
+
+
 @pytest.mark.parametrize("control", ["signals", "priority", "right_before_left"])
 def test_our_own_grids_are_read_back(control: str, tmp_path: Path) -> None:
     network = Network.grid(2, 3, control=control)
