@@ -128,12 +128,7 @@ def travel(step, anew, sizes, car, tag, road, site, move, routes):
             break
         if car[W * i + PRESENT] <= 0:
             continue
-        k, h, far, x = (
-            tag[W * i + LINK],
-            tag[W * i + HOP],
-            road[LONG] - road[LONG],
-            car[W * i + POSITION],
-        )
+        k, h, far, x = tag[W * i + LINK], tag[W * i + HOP], road[LONG] - road[LONG], car[W * i + POSITION]
         while x - far >= road[K * k + LONG]:
             h += 1
             far += road[K * k + LONG]

@@ -83,10 +83,8 @@ class NetworkRows:
         phases = ways.phases.expand(*shape[:-1], len(network.plans)).reshape(rows, -1).contiguous().numpy()
         road, site, move, against, plans = _tables(network, kind)
         rules, drivers = _rules(stepping, params, state)
-        return cls(
-            cars, tags, road, site, move, against, ways.routes.contiguous().numpy(), rules, drivers,
-            plans, phases,
-        )  # fmt: skip
+        routes = ways.routes.contiguous().numpy()
+        return cls(cars, tags, road, site, move, against, routes, rules, drivers, plans, phases)
 
     def tables(self) -> tuple[tuple[Any, ...], tuple[Array, ...], Array]:
         """Return the arguments of an event, with room of its own for its findings."""
@@ -241,16 +239,8 @@ def chains_of(simulator: Simulator, state: State, params: Params, halo: int) -> 
 
 def _paths(kind: np.dtype, n: Any, wide: Any, tiles: Any) -> tuple[Array, ...]:
     """Return room for layouts."""
-    led, leads = np.zeros(wide, kind), np.zeros(wide, kind)
-    return (
-        np.zeros(wide, np.int64),
-        np.zeros(wide, np.int64),
-        led,
-        leads,
-        np.zeros(wide, np.uint8),
-        np.zeros(n, np.int64),
-        np.zeros(tiles, np.int64),
-    )
+    kinds = np.int64, np.int64, kind, kind, np.uint8, np.int64, np.int64
+    return tuple(np.zeros(*each) for each in zip((*(wide,) * 5, n, tiles), kinds, strict=True))
 
 
 def _in_place(
