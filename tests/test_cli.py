@@ -191,7 +191,7 @@ def test_two_conditions_both_hold(tmp_path: Path) -> None:
 def test_killed_and_resumed_gives_the_same_result(tmp_path: Path) -> None:
     """SIGINT ends with code 130 and a hint; SIGKILL leaves a checkpoint; --resume ends as an undisturbed run does."""
     path = tmp_path / "good.csv"
-    synthetic.generate(2, runs=6, followers=3, seconds=120.0)[0].table.drop("gap_m").write_csv(path)
+    synthetic.generate(2, runs=2, followers=2, seconds=60.0)[0].table.drop("gap_m").write_csv(path)
     options = ("--method", "adam", "--out")
     assert typed("fit", path, *options, tmp_path / "whole").returncode == 0
     for number in (signal.SIGINT, signal.SIGKILL):

@@ -81,16 +81,16 @@ def my_csv(folder: Path) -> None:
 
 
 def tired_csv(folder: Path) -> None:
-    """Eight platoons whose drivers want to go slower by 0.3 % every second; 5 cm of noise."""
+    """Seven platoons whose drivers want to go slower by 0.3 % every second; 5 cm of noise."""
     fatigue = importlib.import_module("fatigue").Fatigue
     simulator = Simulator(Lane(), (IDM(), fatigue(), Brakes(), Replay()), dt=0.1)
     generator = torch.Generator().manual_seed(3)
-    steps, tables = 1500, []
+    steps, tables = 1000, []
 
     def draw(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-    for run in range(8):
+    for run in range(7):
         params = simulator.defaults(dtype=torch.float64)
         params["fatigue"]["rate"] = torch.tensor(3e-3, dtype=torch.float64)
         params["idm"] = {name: x * torch.exp(0.1 * draw(4)) for name, x in params["idm"].items()}

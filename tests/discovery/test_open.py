@@ -96,7 +96,7 @@ def tired(seed: int, rate: float, runs: int = 10) -> Trajectories:
 
 def test_an_effect_of_ones_own_is_found_in_data_that_have_it(tmp_path: Path) -> None:
     """README's claim: from its class alone."""
-    found = discover(tired(3, 0.004), effects=[f"{EXAMPLE}:Fatigue", "delay", "drag"])
+    found = discover(tired(3, 0.004), effects=[f"{EXAMPLE}:Fatigue", "delay", "drag"], located=False)
     assert [f["effect"] for f in found.report["found"]] == ["fatigue"]
     assert found.report["found"][0]["parameters"]["rate"]["estimate"] == pytest.approx(0.004, rel=0.15)
     save_model(tmp_path / "model.yaml", found.models["model.yaml"])

@@ -30,7 +30,7 @@ def test_nothing_is_found_on_laps_with_nothing_hidden() -> None:
 
 def test_a_pair_that_cancels_is_named() -> None:
     true = {"delay": 0.5, "leader_acceleration": 0.4}
-    data, _ = synthetic.generate(77, effect=true)
+    data, _ = synthetic.generate(77, effect=true, runs=8, followers=2, seconds=120.0)
     found = discover(data, effects=["delay", "leader_acceleration", "second_leader", "drag"], seed=1).report
     assert {f["effect"] for f in found["found"]} == set(true)
     estimates = {f["effect"]: next(iter(f["parameters"].values()))["estimate"] for f in found["found"]}
@@ -49,7 +49,7 @@ def test_an_answer_to_the_leaders_past_is_none_to_his_acceleration() -> None:
 
 
 def test_what_no_candidate_explains_is_said_to_be_there() -> None:
-    data, _ = synthetic.generate(21, effect="leader_acceleration", runs=12, followers=2, seconds=90.0)
+    data, _ = synthetic.generate(21, effect="leader_acceleration", runs=8, followers=2, seconds=90.0)
     found = discover(data, effects=["drag", "memory"])
     assert found.verdict == "unexplained"
     assert found.report["found"] == [] and "no candidate explains" in found.report["sentence"]

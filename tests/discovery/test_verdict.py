@@ -286,7 +286,7 @@ def test_what_makes_every_error_worse_is_not_named(monkeypatch: pytest.MonkeyPat
         return replace(judged, gap=judged.gap + 3.0, speed=judged.speed + 1.0, ahead=np.abs(judged.ahead) + 2.0)
 
     monkeypatch.setattr(crossed, "crossed", contrary)
-    found = discover(few(effect="lag"), effects=["lag", "drag"])
+    found = discover(few(effect="lag"), effects=["lag", "drag"], located=False)
     report = found.report
     assert report["verdict"] == "unexplained" and report["reason"] == "held_out" and report["found"] == []
     assert "no error falls on the test set" in report["sentence"] and "response lag" in report["sentence"]

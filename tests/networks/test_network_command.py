@@ -38,8 +38,9 @@ def tables(out: Path) -> dict[str, pl.DataFrame]:
     return {name: pl.read_csv(out / f"{name}.csv", glob=False) for name in network_job.TABLES}
 
 
-def test_its_files_agree(files: tuple[Path, Path], tmp_path: Path) -> None:
+def test_its_files_agree(files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Everybody arrives, no sooner than at the limits; counts over time are of the trips; pictures are pictures."""
+    monkeypatch.setattr(network_job, "FRAMES", 24)  # drawing one takes as long as 20 s of traffic
     result = simulate_network(files[0], [files[1]], tmp_path)
     rows = tables(tmp_path)
     trips, times = rows["trips"], rows["over_time"]
