@@ -42,16 +42,47 @@ def values_of(problem: Problem, solution: Solution, runs: Sequence[str], fold: n
 
 
 @dataclass(frozen=True, eq=False)
-class _Fold:
-    """Drivers of one fold, the others' population, and log θ [2, G, P] by weight, from each half of their time.
+class Halves:
+    """Records twice, once for each half of the drivers' time: so both halves in all folds are solved at once.
 
-    ``left`` [drivers] is what every weight leaves of the gap on the half that was not fitted (m²).
+    A driver is a group of its own in each: ``fold``, ``half`` and ``group`` [D] say which. ``model`` has the folds' φ.
     """
 
-    prior: Population
-    frozen: Hypothesis
-    thetas: dict[float, np.ndarray]
-    left: dict[float, np.ndarray]
+    records: Records
+    model: Hypothesis
+    fold: np.ndarray
+    half: np.ndarray
+    group: np.ndarray
+
+    @classmethod
+    def split(cls, records: Records, model: Hypothesis, values: np.ndarray, fold: np.ndarray) -> "Halves":
+        """Return the halves of records whose runs have a ``fold`` [runs], and the model with its ``values``."""
+        size, twice = len(records.signals), (np.tile(x, 2) for x in (fold[records.run], records.group))
+        each = np.stack([next(twice), np.repeat([0, 1], len(records)), next(twice)])
+        keys, group = np.unique(each, axis=1, return_inverse=True)
+        doubled = replace(
+            records, episodes=2 * records.episodes, signals=np.tile(records.signals, (2, 1)), group=group.ravel(),
+            bounds=np.append(records.bounds, records.bounds[1:] + size), length=np.tile(records.length, 2),
+            first=np.append(records.first, records.first + size), run=np.tile(records.run, 2),
+            groups=tuple(map(str, keys.T.tolist())),
+        )  # fmt: skip
+        return cls(doubled, model.fixed(values[keys[0]]), *keys)
+
+    def rows(self, rows: Rows, half: np.ndarray) -> Rows:
+        """Return rows of the records as rows of a ``half`` [R] of them."""
+        record, start = rows.record + half * (len(self.records) // 2), half * (len(self.records.signals) // 2)
+        return replace(rows, records=self.records, record=record, start=rows.start + start)
+
+    def by_fold(self, x: np.ndarray) -> dict[int, np.ndarray]:
+        """Return values [D, ...] of the groups as [2, drivers, ...] of every fold."""
+        return {int(k): x[self.fold == k].reshape(2, -1, *x.shape[1:]) for k in np.unique(self.fold)}
+
+    def prior(self, theta: np.ndarray, rows: Rows, fold: np.ndarray) -> Population:
+        """Return the population of all other folds for every group, from log θ [G, P] on rows of the records."""
+        of_row, own = fold[rows.run], self.model.catalogue.own
+        others = {int(k): population(theta, rows.some(of_row != k), own) for k in np.unique(of_row)}
+        centre, width = (np.stack([getattr(others[int(k)], x) for k in self.fold]) for x in ("centre", "width"))
+        return Population(centre, width, centre_follows=False)
 
 
 def _loss(left: np.ndarray) -> float:
@@ -90,40 +121,33 @@ def crossed(
     problem, theta = judge.unweighed(
         records, model, values.mean(0), first_prior(own), start=start, calibrated=start is not None
     )
-    second = judge.halves(rows)
-    halves = [replace(rows, valid=part).settled() for part in (rows.valid & ~second, second)]
-    middle = model.fixed(values.mean(0))
-    # Where every driver is the population's middle, no driver needs to be fitted to half of his time.
-    apart = [] if pooled else [replace(problem, rows=half) for half in halves]
-    ends = [solve(half, middle, theta, EMPTY, iterations=10, tolerance=1e-4).theta for half in apart]
-    near = np.stack(ends or [theta, theta])
-    of_row = fold[rows.run]
-    parts: dict[int, _Fold] = {}
-    for k in np.unique(of_row):
-        prior = population(theta, rows.some(of_row != k), own)
-        mine = [half.some(of_row == k) for half in halves]
-        frozen = model.fixed(values[k])
-        if pooled:
-            everyone = {POOLED_S: np.broadcast_to(prior.centre, near.shape)}
-            parts[int(k)] = _Fold(prior, frozen, everyone, {POOLED_S: np.ones(1)})
-        else:
-            parts[int(k)] = _weighed(mine, prior, frozen, near)
-    gap, speed, thetas = _simulated(rows, second, fold, parts)
+    second, halves = judge.halves(rows), Halves.split(records, model, values, fold)
+    twice = halves.rows(rows.some(np.tile(np.arange(len(rows)), 2)), np.repeat([0, 1], len(rows)))
+    settled = replace(twice, valid=np.concatenate([rows.valid & ~second, second])).settled()
+    prior = halves.prior(theta, rows, fold)
+    best = prior.centre
+    if not pooled:
+        apart, middle = replace(problem, rows=settled), model.fixed(values.mean(0))
+        near = solve(apart, middle, theta[halves.group], EMPTY, iterations=10, tolerance=1e-4).theta
+        best = _weighed(halves, replace(apart, prior=prior), near)
+    both = Problem(twice, None, prior).predict(best[None], halves.model, EMPTY[None])
+    # A sample is scored with the drivers of the half that it is not in.
+    gap, speed = (np.where(second, *x[0].reshape(2, *second.shape)) for x in both)
     short, longer = windows(records), in_blocks(records)
     problem = Problem(short, None, first_prior(own))
-    ahead = _predicted(problem, model, values, fold, thetas)
+    ahead = predicted(problem, halves, best)
     if not pooled:
-        whitened = replace(problem, noise=first_noise(short))
-        noise = estimate(_predicted(whitened, model, values, fold, thetas), short.joined)
-        others = _whitened(replace(problem, noise=noise.unweighted(len(short))), model, values, fold, theta)
-        other = _predicted(problem, model, values, fold, others)
-        left = [_loss(np.bincount(short.group, x[:, -1] ** 2)[np.unique(short.group)]) for x in (ahead, other)]
-        ahead, thetas = (other, others) if left[1] < left[0] else (ahead, thetas)
+        noise = estimate(predicted(replace(problem, noise=first_noise(short)), halves, best), short.joined)
+        by_noise = replace(problem, noise=noise.unweighted(len(short)))
+        others = whitened(by_noise, halves, middle, fold, theta)
+        other = predicted(problem, halves, others)
+        losses = [_loss(np.bincount(short.group, x[:, -1] ** 2)[np.unique(short.group)]) for x in (ahead, other)]
+        ahead, best = (other, others) if losses[1] < losses[0] else (ahead, best)
     further = EMPTY
     if longer is not None:
-        further = _predicted(replace(problem, rows=longer), model, values, fold, thetas)[:, -1]
-    judged = [th[:, np.unique(rows.group[of_row == k])] for k, th in thetas.items()]
-    return judge.Judged(rows, gap, speed, ahead[:, -1], short.record, further, np.concatenate(judged, axis=1))
+        further = predicted(replace(problem, rows=longer), halves, best)[:, -1]
+    judged = np.concatenate(list(halves.by_fold(best).values()), axis=1)
+    return judge.Judged(rows, gap, speed, ahead[:, -1], short.record, further, judged)
 
 
 def in_blocks(records: Records) -> Rows | None:
@@ -139,73 +163,56 @@ def in_blocks(records: Records) -> Rows | None:
     return rows.some(inside) if inside.any() else None
 
 
-def _weighed(mine: list[Rows], prior: Population, frozen: Hypothesis, near: np.ndarray) -> _Fold:
-    """Fit the drivers of a fold to each half of their time with every weight of the population."""
+def _weighed(halves: Halves, problem: Problem, near: np.ndarray) -> np.ndarray:
+    """Return log θ [D, P] of all drivers fitted to each half of their time, from ``near`` [D, P].
+
+    Every weight of the population is tried; the other folds choose one, by the gap on the half that was not fitted.
+    """
     thetas: dict[float, np.ndarray] = {}
-    left: dict[float, np.ndarray] = {}
-    seen = np.unique(mine[0].group)
-    count = np.sum([Problem(half, None, prior).per_group(half.valid.sum(1)) for half in mine], axis=0)
-    grid: Sequence[float] = GRID_S[::2]
-    while grid:
-        for seconds in grid:
-            begin = thetas[min(thetas, key=lambda s: abs(np.log(s / seconds)))] if thetas else near
-            fitted, square = [], np.zeros(near.shape[1])
-            for i, half in enumerate(mine):
-                problem = Problem(half, None, replace(prior, centre_follows=False, error_correlation_s=seconds))
-                problem = judge.scaled(problem, frozen, EMPTY, near[i])
-                fitted.append(solve(problem, frozen, begin[i], EMPTY, iterations=10, tolerance=1e-4).theta)
-                other_half = replace(problem, rows=mine[1 - i])
-                errors = other_half.errors(fitted[i][None], frozen, EMPTY[None])[0]
-                square += other_half.per_group((errors**2).sum(1))
-            thetas[seconds], left[seconds] = np.stack(fitted), square[seen] / np.maximum(count[seen], 1)
-        grid = further({s: _loss(x) for s, x in left.items()})
-    return _Fold(prior, frozen, thetas, left)
+    count, side = halves.by_fold(problem.per_group(problem.rows.valid.sum(1))), 2 * halves.fold + halves.half
+    squares = (problem.errors(near[None], halves.model, EMPTY[None])[0] ** 2).sum(1)
+    squares /= np.maximum(problem.rows.valid.sum(1), 1)
+    # Errors of so many seconds count as one, as in ``judge.scaled``: by fold and half.
+    middles = {s: max(np.median(squares[side[problem.rows.group] == s]), 1e-4) for s in np.unique(side)}
+    usual = np.array([middles[s] for s in side[problem.rows.group]])
+    left: dict[int, dict[float, np.ndarray]] = {k: {} for k in count}
+    grids: dict[int, Sequence[float]] = dict.fromkeys(left, GRID_S[::2])
+    while any(grids.values()):
+        for seconds in sorted({s for grid in grids.values() for s in grid}):
+            asks = [k for k, grid in grids.items() if seconds in grid]
+            begin, fitted = near.copy(), np.isin(halves.fold, asks)
+            for k in asks:
+                if left[k]:
+                    mine = halves.fold == k
+                    begin[mine] = thetas[min(left[k], key=lambda s: abs(np.log(s / seconds)))][mine]
+            size = np.sqrt(usual * seconds / (problem.rows.every * problem.rows.records.dt))
+            part = replace(problem, sigma=size[:, None]).of_rows(fitted[problem.rows.group])
+            thetas[seconds] = solve(part, halves.model, begin, EMPTY, iterations=10, tolerance=1e-4).theta
+            other_half = replace(part.rows, valid=np.roll(part.rows.valid, len(part.rows) // 2, axis=0))
+            errors = replace(part, rows=other_half).errors(thetas[seconds][None], halves.model, EMPTY[None])[0]
+            total = halves.by_fold(part.per_group((errors**2).sum(1)))
+            for k in asks:
+                left[k][seconds] = total[k].sum(0) / np.maximum(count[k].sum(0), 1)
+        grids = {k: further({s: _loss(x) for s, x in left[k].items()}) for k in left}
+    weights, best = sorted(set.intersection(*map(set, left.values()))), np.empty_like(thetas[min(thetas)])
+    for k in left:
+        others = [x for j, x in left.items() if j != k or len(left) == 1]
+        seconds = min(weights, key=lambda s: _loss(np.concatenate([x[s] for x in others])))
+        best[halves.fold == k] = thetas[seconds][halves.fold == k]
+    return best
 
 
-def _simulated(
-    rows: Rows, second: np.ndarray, fold: np.ndarray, parts: dict[int, _Fold]
-) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
-    """Return gaps and speeds of closed-loop simulation with the weight that the other folds choose, and log θ there."""
-    (gap, speed), chosen = np.zeros((2, *rows.valid.shape)), {}
-    # Of two copies, the second is scored where the first was fitted.
-    copy, weights = (~second).astype(int), set.intersection(*(set(p.left) for p in parts.values()))
-    for k, part in parts.items():
-        others = [p.left for j, p in parts.items() if j != k or len(parts) == 1]
-        best = min(sorted(weights), key=lambda s: _loss(np.concatenate([left[s] for left in others])))
-        chosen[k], in_fold = part.thetas[best], fold[rows.run] == k
-        one = Problem(rows.some(in_fold), None, part.prior).predict(chosen[k], part.frozen, np.zeros((2, 0)))
-        gap[in_fold], speed[in_fold] = (np.take_along_axis(x, copy[in_fold][None], 0)[0] for x in one)
-    return gap, speed, chosen
-
-
-def _whitened(
-    problem: Problem, model: Hypothesis, values: np.ndarray, fold: np.ndarray, theta: np.ndarray
-) -> dict[int, np.ndarray]:
-    """Return log θ [2, G, P] of every fold, from whitened predictions 5 s ahead of each half of the drivers' blocks."""
+def whitened(problem: Problem, halves: Halves, middle: Hypothesis, fold: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Return log θ [D, P] from whitened predictions 5 s ahead of each half of the drivers' blocks, from [G, P]."""
     # The window before the first of a block is in the other half.
     rows = replace(problem.rows, joined=problem.rows.joined & (problem.rows.block == np.roll(problem.rows.block, 1)))
-    free, second = replace(problem, rows=rows, prior=replace(problem.prior, centre_follows=False)), rows.block % 2 == 1
-    all_time = solve(free, model.fixed(values.mean(0)), theta, EMPTY, iterations=15, tolerance=1e-3).theta
-    thetas = {}
-    for k in np.unique(fold[rows.run]):
-        mine = fold[rows.run] == k
-        prior = replace(population(all_time, rows.some(~mine), model.catalogue.own), centre_follows=False)
-        own = replace(free, prior=prior)
-        parts = [own.of_rows(mine & half) for half in (~second, second)]
-        ends = [solve(part, model.fixed(values[k]), all_time, EMPTY, iterations=10) for part in parts]
-        thetas[int(k)] = np.stack([end.theta for end in ends])
-    return thetas
+    free = replace(problem, rows=rows, prior=replace(problem.prior, centre_follows=False))
+    theta = solve(free, middle, theta, EMPTY, iterations=15, tolerance=1e-3).theta
+    apart = replace(free, rows=halves.rows(rows, rows.block % 2), prior=halves.prior(theta, rows, fold))
+    return solve(apart, halves.model, theta[halves.group], EMPTY, iterations=10).theta
 
 
-def _predicted(
-    problem: Problem, model: Hypothesis, values: np.ndarray, fold: np.ndarray, thetas: dict[int, np.ndarray]
-) -> np.ndarray:
-    """Return errors of predictions [windows, m] with log θ [2, G, P] of every fold, from the half not scored."""
-    rows, copy = problem.rows, (problem.rows.block % 2 == 0).astype(int)
-    errors, order = [], []
-    for k, theta in thetas.items():
-        mine = np.flatnonzero(fold[rows.run] == k)
-        both = replace(problem, rows=rows.some(mine)).errors(theta, model.fixed(values[k]), np.zeros((2, 0)))
-        errors.append(both[copy[mine], np.arange(len(mine))])
-        order.append(mine)
-    return np.concatenate(errors)[np.argsort(np.concatenate(order))]
+def predicted(problem: Problem, halves: Halves, theta: np.ndarray) -> np.ndarray:
+    """Return errors of predictions [windows, m] with log θ [D, P] of the half that is not scored."""
+    rows = halves.rows(problem.rows, 1 - problem.rows.block % 2)
+    return np.asarray(replace(problem, rows=rows).errors(theta[None], halves.model, EMPTY[None])[0])

@@ -89,7 +89,7 @@ class Hypothesis:
     terms: tuple[Term, ...] = ()
     catalogue: Catalogue = field(default_factory=march.default_catalogue)
     fixed_phi: np.ndarray | None = None
-    """φ that stands, so that only the drivers' own parameters are left to fit."""
+    """φ that stands [F] or [G, F], so that only the drivers' own parameters are left to fit."""
     entries: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -119,7 +119,7 @@ class Hypothesis:
         return Hypothesis(self.terms[:index] + self.terms[index + 1 :], self.catalogue)
 
     def fixed(self, values: np.ndarray) -> Hypothesis:
-        """Return the model with φ as the values [Q] of its parameters give it, the same for all copies and groups."""
+        """Return the model with φ as the values [Q] or [G, Q] of its parameters give it, the same for all copies."""
         return replace(self, fixed_phi=self.phi(values))
 
     def where(self, label: str) -> slice:
@@ -165,7 +165,7 @@ class Hypothesis:
         """Return φ from the values of all parameters [..., Q]."""
         values = np.asarray(values, float)
         if self.fixed_phi is not None:
-            return np.broadcast_to(self.fixed_phi, (*values.shape[:-1], len(self.fixed_phi)))
+            return np.broadcast_to(self.fixed_phi, (*values.shape[:-1], self.fixed_phi.shape[-1]))
         phi = np.tile(self.catalogue.null, (*values.shape[:-1], 1))
         for term, slot in self._slots:
             if term.form == march.NONE:

@@ -36,7 +36,7 @@ LONG_S = 0.2
 class Population:
     """Drivers' own θ as the prior of each: log-normal, centre [P] and width [P] of log θ, which is what moves here.
 
-    Fits know another one (``fitting.prior.Prior``), of θ itself, with the noise of their residuals.
+    Both may be [G, P]. Fits know another one (``fitting.prior.Prior``), of θ itself, with the noise of their residuals.
     The centre moves with the drivers where ``centre_follows``.
     ``error_correlation_s`` is its weight in closed loop: errors of so many seconds count as one (``closed_loop``).
     ``seen`` are the groups that have data: their mean is the centre, so that a shift of all of them costs nothing.
@@ -49,9 +49,9 @@ class Population:
     seen: tuple[int, ...] = ()
 
     def equations(self, own: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what the prior adds to cost [..., G], gradient [..., G, 5] and matrix [5, 5]; own is log θ."""
+        """Return what the prior adds to cost [..., G], gradient [..., G, 5] and matrix [..., 5, 5]; own is log θ."""
         off, weight = own - torch.from_numpy(self.centre), torch.from_numpy(self.width**-2.0)
-        return (weight * off.square()).sum(-1), weight * off, torch.diag(weight)
+        return (weight * off.square()).sum(-1), weight * off, torch.diag_embed(weight)
 
     def following(self, own: Tensor) -> Population:
         """Return the prior centred at the mean of the drivers [1, G, 5], if there are enough of them."""
@@ -64,13 +64,13 @@ class Population:
 class Problem:
     """Rows, how their errors are judged, and the prior: everything that is common to the null and all candidates.
 
-    ``noise`` None means free simulation: plain gap errors in units of ``sigma`` (m).
+    ``noise`` None means free simulation: plain gap errors in units of ``sigma`` (m), one for all rows or [R, 1].
     """
 
     rows: Rows
     noise: Noise | None
     prior: Population
-    sigma: float = 0.3
+    sigma: float | np.ndarray = 0.3
 
     @property
     def groups(self) -> int:
@@ -136,7 +136,8 @@ class Problem:
     def of_rows(self, mask: np.ndarray) -> Problem:
         """Return the problem of some rows ``mask`` [R], all those of their groups."""
         noise = self.noise and replace(self.noise, weight=self.noise.weight[mask])
-        return replace(self, rows=self.rows.some(mask), noise=noise)
+        sigma = self.sigma[mask] if isinstance(self.sigma, np.ndarray) else self.sigma
+        return replace(self, rows=self.rows.some(mask), noise=noise, sigma=sigma)
 
 
 @dataclass(frozen=True, eq=False)
