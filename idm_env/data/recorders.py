@@ -55,19 +55,20 @@ def clock_offsets(trajectories: Trajectories) -> dict[tuple[str, str], float]:
     few = counts.filter(pl.col("count") <= MOST_DRIVERS).sort("run_id")
     some = few.filter(pl.col("count").cum_sum() <= MOST_DRIVERS)["run_id"].to_list()
     measured = bool(trajectories.table["gap_measured"].any())
-    errors = (_rate_error, _rate_error) if measured else (_response_error, partial(_response_error, second=True))
+    errors = (_rate_errors, _rate_errors) if measured else (_response_errors, partial(_response_errors, second=True))
     items = _long_episodes(trajectories, some, not measured)
     by_track = {(e.run_id, e.vehicle_id): i for i, e in enumerate(items)}
     ahead = [(i, by_track[e.run_id, e.leader_id]) for i, e in enumerate(items) if (e.run_id, e.leader_id) in by_track]
     if len(ahead) < LEAST_PAIRS or items[0].dt > HALF_S:
         return {}
-    bare, both = (np.array([[_shift(e, p, error) for p in _parts(e)] for e in items]) for error in errors)
     i, j = np.array(ahead).T
-    opposite, rest = (np.corrcoef(x[i, 0], x[j, 0])[0, 1] for x in (bare, both))
-    lasting, spread = np.corrcoef(bare[:, 1], bare[:, 2])[0, 1], bare[:, 0].std()
-    is_second = rest > 0.0 or both[:, 0].std() < 0.5 * spread
-    is_one_sided = min(bare[:, 0].max(), -bare[:, 0].min()) < LEAST_SPREAD_S
-    if is_second or is_one_sided or opposite > OPPOSITE or lasting < LASTING or spread < LEAST_SPREAD_S:
+    whole, first, last = np.array([[_shift(e, p, errors[0]) for p in _parts(e)] for e in items]).T
+    opposite, lasting = np.corrcoef(whole[i], whole[j])[0, 1], np.corrcoef(first, last)[0, 1]
+    sides = min(whole.max(), -whole.min(), spread := whole.std())
+    if sides < LEAST_SPREAD_S or opposite > OPPOSITE or lasting < LASTING:
+        return {}
+    second = np.array([_shift(e, _parts(e)[0], errors[1]) for e in items])
+    if np.corrcoef(second[i], second[j])[0, 1] > 0.0 or second.std() < 0.5 * spread:
         return {}
     items = _long_episodes(trajectories, few["run_id"].to_list(), not measured)
     single = [_shift(e, _parts(e)[0], errors[0]) for e in items]
@@ -106,9 +107,9 @@ def _parts(episode: Episode) -> list[np.ndarray]:
     return [np.ones(len(episode), bool), first, ~first]
 
 
-def _shift(e: Episode, part: np.ndarray, error: Callable[[Episode, float, np.ndarray], float]) -> float:
+def _shift(e: Episode, part: np.ndarray, of_shifts: Callable[[Episode, np.ndarray], np.ndarray]) -> float:
     """Return the shift of the leader's record (s) at which an error is least, by parabola."""
-    errors = np.array([error(e, shift, part) for shift in SHIFTS])
+    errors = of_shifts(e, part)
     k = min(max(int(errors.argmin()), 1), len(SHIFTS) - 2)
     a, b, c = errors[k - 1 : k + 2]
     move = np.clip(0.5 * (a - c) / (a - 2 * b + c), -1, 1) if a - 2 * b + c > 0 else 0.0
@@ -122,23 +123,25 @@ def _inner(e: Episode, part: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
     return max(1, round(HALF_S / e.dt)), time, use
 
 
-def _rate_error(e: Episode, shift: float, part: np.ndarray) -> float:
-    """Return the mean square of the measured gap's rate less the difference of speeds (m²/s²)."""
+def _rate_errors(e: Episode, part: np.ndarray) -> np.ndarray:
+    """Return by shift the mean square of the measured gap's rate less the difference of speeds (m²/s²)."""
     k, time, use = _inner(e, part)
     rate = (np.roll(e.gap_m, -k) - np.roll(e.gap_m, k)) / (2 * k * e.dt)
-    left = rate - np.interp(time + shift, time, e.leader.speed_mps) + e.speed_mps
-    return float((left[use] ** 2).mean()) if use.any() else 0.0
+    left = rate - np.interp(time + SHIFTS[:, None], time, e.leader.speed_mps) + e.speed_mps
+    return np.asarray((left[:, use] ** 2).sum(1) / max(int(use.sum()), 1))
 
 
-def _response_error(e: Episode, shift: float, part: np.ndarray, second: bool = False) -> float:
-    """Return the mean square of the residual accelerations (m²/s⁴), at the samples of ``part`` [T]."""
+def _response_errors(e: Episode, part: np.ndarray, second: bool = False) -> np.ndarray:
+    """Return by shift the mean square of residual accelerations (m²/s⁴), at the samples of ``part`` [T]."""
     (k, time, use), v = _inner(e, part), e.speed_mps
     accel, own = (np.roll(v, -k) - np.roll(v, k))[use] / (2 * k * e.dt), v[use] / 10.0
-    terms = [np.ones(len(accel)), own**4]
+    then, terms = time[use] + SHIFTS[:, None], [np.ones(len(accel)), own**4]
     for other in (e.leader, e.second_leader) if second and e.second_leader.present.all() else (e.leader,):
-        place, speed = (np.interp(time + shift, time, x)[use] for x in (other.position_m, other.speed_mps))
+        place, speed = (np.interp(then, time, x) for x in (other.position_m, other.speed_mps))
         gap, closing = np.maximum(place - other.length_m - e.position_m[use], 1.0) / 10.0, v[use] - speed
         terms += [x / gap**2 for x in (1.0, own, own**2, own * closing, own**2 * closing, (own * closing) ** 2)]
-    matrix = np.stack(terms, axis=1)
-    left = accel - matrix @ np.linalg.lstsq(matrix, accel, rcond=None)[0]
-    return float((left**2).mean()) if len(left) > 4 * len(terms) else 0.0
+    if len(accel) <= 4 * len(terms):
+        return np.zeros(len(SHIFTS))
+    # The last number of a triangle is what its other columns leave of the last one.
+    each = np.stack([np.broadcast_to(x, then.shape) for x in (*terms, accel)], axis=-1)
+    return np.asarray(np.asarray(np.linalg.qr(each, mode="r"))[:, -1, -1] ** 2 / len(accel))
