@@ -143,9 +143,7 @@ def crossed(
         other = predicted(problem, halves, others)
         losses = [_loss(np.bincount(short.group, x[:, -1] ** 2)[np.unique(short.group)]) for x in (ahead, other)]
         ahead, best = (other, others) if losses[1] < losses[0] else (ahead, best)
-    further = EMPTY
-    if longer is not None:
-        further = predicted(replace(problem, rows=longer), halves, best)[:, -1]
+    further = EMPTY if longer is None else predicted(replace(problem, rows=longer), halves, best)[:, -1]
     judged = np.concatenate(list(halves.by_fold(best).values()), axis=1)
     return judge.Judged(rows, gap, speed, ahead[:, -1], short.record, further, judged)
 
@@ -157,8 +155,7 @@ def in_blocks(records: Records) -> Rows | None:
     except DataError:
         return None
     since, dt = rows.start - records.first[rows.record], records.dt
-    spans = (records.bounds[1:] - records.first)[rows.record] * dt
-    sizes = np.array([block_seconds(span) for span in spans])
+    sizes = block_seconds((records.bounds[1:] - records.first) * dt)[rows.record]
     inside = ((since + rows.steps) * dt // sizes).astype(int) == rows.block
     return rows.some(inside) if inside.any() else None
 

@@ -206,14 +206,10 @@ def windowed(records: Records, problem: Problem, solution: Solution) -> tuple[Pr
 
 def halves(rows: Rows) -> np.ndarray:
     """Return [R, samples] which samples lie in every second block of time: 30 s, or a quarter of a shorter record."""
-    records = rows.records
-    scored = np.zeros(rows.valid.shape, bool)
-    for i in range(len(rows)):
-        r = rows.record[i]
-        span = float(records.bounds[r + 1] - records.first[r]) * records.dt
-        time = (rows.samples[i] - records.first[r]) * records.dt
-        scored[i] = (time // block_seconds(span)).astype(int) % 2 == 1
-    return scored & rows.valid
+    records, first = rows.records, rows.records.first[rows.record]
+    sizes = block_seconds((records.bounds[rows.record + 1] - first) * records.dt)
+    number = (rows.samples - first[:, None]) * records.dt // sizes[:, None]
+    return np.asarray((number.astype(int) % 2 == 1) & rows.valid)
 
 
 def judge(records: Records, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Judged:

@@ -271,16 +271,16 @@ def windows(records: Records, seconds: float = WINDOW_S, every_s: float = 0.5) -
     every = max(1, round(every_s / dt))
     steps = max(2, round(seconds / dt / every)) * every
     record, start, joined, block = [], [], [], []
+    sizes = block_seconds((records.bounds[1:] - records.first) * dt)
     for r in range(len(records)):
         begin, end = int(records.first[r]), int(records.bounds[r + 1])
         span = (end - begin) * dt
         before, after = TRIM_S if span >= SHORT_S else (1.0, 1.0)
-        size = block_seconds(span)
         starts = np.arange(begin + round(before / dt), end - round(after / dt) - steps, steps)
         record += [r] * len(starts)
         start += starts.tolist()
         joined += [i > 0 for i in range(len(starts))]
-        block += ((starts - begin) * dt // size).astype(int).tolist()
+        block += ((starts - begin) * dt // sizes[r]).astype(int).tolist()
     if not record:
         raise DataError(f"no record is longer than {seconds + 2:g} s; discovery needs longer tracks.")
     valid = np.ones((len(record), steps // every), bool)
@@ -307,6 +307,6 @@ def whole(records: Records, longest_s: float = 300.0, every_s: float = 0.5) -> R
     return Rows(records, np.array(record), first, count * every, every, valid, *none)
 
 
-def block_seconds(span: float) -> float:
-    """Length of the blocks that are held out in turn: 30 s, or a quarter of a shorter record, at least 5 s."""
-    return float(np.clip(span / 4.0, 5.0, 30.0))
+def block_seconds(span: np.ndarray) -> np.ndarray:
+    """Return lengths (s) [records] of blocks held out in turn: 30 s, or a quarter of a shorter record, at least 5 s."""
+    return np.clip(span / 4.0, 5.0, 30.0)
