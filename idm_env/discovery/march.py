@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from idm_env import delay_buffer, effects as known
-from idm_env.compiled.kernels import threads
+from idm_env.compiled.kernels import record_lanes, threads
 from idm_env.compiled.records import march_loops
 from idm_env.compiled.scalar import library
 from idm_env.compiled.scalar.graph import Leaf, TimeStep
@@ -229,8 +229,8 @@ class Loop:
         def split(record: np.ndarray, start: np.ndarray, steps: int, work: int, *winding: np.ndarray) -> None:
             arguments: tuple[Any, ...] = records.signals, records.bounds, record, start, records.group[record], *law
             arguments += lead, steps, rows.every, pulse, *winding, wound, *out
-            tiles = -(-len(theta) * len(record) // march_loops.LANES)
-            count = threads.count(march_loops.LANES * tiles * work)
+            tiles = -(-len(theta) * len(record) // record_lanes.LANES)
+            count = threads.count(record_lanes.LANES * tiles * work)
             threads.split(lambda begin, end: module.march(*arguments, begin, end), tiles, 1, count)
 
         settle = np.maximum(records.bounds[rows.record], rows.start - lead)
@@ -248,16 +248,10 @@ class Loop:
 def why_not_recorded(effect: Effect, dt: float = 0.1) -> str | None:
     """Return why an effect cannot be put into the loop, or None."""
     try:
-        _printed(Catalogue((effect,)), dt)
+        loop(Catalogue((effect,)), dt)
     except (Untraceable, ValueError) as error:
         return str(error)
     return None
-
-
-@lru_cache(maxsize=16)
-def loop(catalogue: Catalogue, dt: float) -> Loop:
-    """Return the loop of a catalogue; recorded and printed once per process, compiled once per printed text."""
-    return _printed(catalogue, dt)
 
 
 def pulsed(catalogue: Catalogue, pulse: np.ndarray, on: np.ndarray, phi: np.ndarray) -> np.ndarray:
@@ -284,7 +278,12 @@ def back_steps(effects: Sequence[Effect], dt: float) -> int:
     return delay_buffer.slots(seconds, dt) + 1 if seconds else 0
 
 
-def _printed(catalogue: Catalogue, dt: float) -> Loop:
+@lru_cache(maxsize=64)
+def loop(catalogue: Catalogue, dt: float) -> Loop:
+    """Return the loop of a catalogue; recorded and printed once per process, compiled once per printed text.
+
+    ValueError for an effect that reads what records do not show.
+    """
     graph = Regions()
     recorded = _recorded(catalogue, dt, graph)
     read_tables = {node.label for node in graph.serial if node.op == "table"}

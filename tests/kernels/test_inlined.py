@@ -9,9 +9,9 @@ import pytest
 pytest.importorskip("numba")
 import numba
 
-from idm_env.compiled.kernels.curves import column, recall
 from idm_env.compiled.kernels.emitted import inlined
 from idm_env.compiled.kernels.functions import exp_float64, power_float64, sigmoid_float64
+from idm_env.compiled.kernels.record_lanes import column, recall
 
 LANES = 8
 

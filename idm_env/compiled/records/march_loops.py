@@ -5,26 +5,19 @@ This file is a template (``march``). What is printed is walked once (``kernels.e
 that many numbers, which printed lines work on as one.
 """
 
-# ruff: noqa: F401, F821
+# ruff: noqa: F401, F403, F405
 # mypy: ignore-errors
 from __future__ import annotations
 
 import numpy as np
 
 from idm_env.compiled.kernels.compiler import compiler
-from idm_env.compiled.kernels.curves import column, curve, recall
 from idm_env.compiled.kernels.emitted import inlined
 from idm_env.compiled.kernels.functions import exp_float64 as exp, power_float64 as power, sigmoid_float64 as sigmoid
+from idm_env.compiled.kernels.record_lanes import *
 
 log1p, tanh = np.log1p, np.tanh
 ROOM = 68
-LANES = 8
-SPEED, ACCEL, DISPLACEMENT, POSITION, GAP, LENGTH, LEAD_SPEED, LEAD_ACCEL, STEP, PLACE, PULSE, OFFSET, PUSH = range(13)
-"""Rows of ``state``; the first three those of ``moved``, memories at the beginning behind them."""
-COLUMN = 13
-"""The row of ``state`` with the first column of the record; of these those are filled that somebody reads."""
-SAMPLE, LANE, DRIVER, ROW, COPY, ORIGIN, FIRST, LAST = range(8)
-"""Rows of ``index``: the sample of now, the lane, place in φ, row, copy; first samples of the row and of its record."""
 compiled = compiler()
 
 
@@ -61,23 +54,6 @@ def respond(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memo
     """Fill ``memory`` with memories Δt later, ``moved`` with speed and acceleration after the step and displacement."""
     # <respond>
     # </respond>
-
-
-@compiled
-def seat(tile, index, state, p, th, record, start, group, length, bounds, theta, phi, used):
-    """Give every lane of a tile its copy and row, copies of a row one beside another, and load their parameters."""
-    copies = theta.shape[0]
-    for lane in range(LANES):
-        both = min(tile * LANES + lane, copies * len(record) - 1)
-        row, copy = both // copies, both % copies
-        r, driver = record[row], copy * theta.shape[1] + group[row]
-        index[LANE, lane], index[DRIVER, lane], index[ROW, lane], index[COPY, lane] = lane, driver, row, copy
-        index[ORIGIN, lane], index[FIRST, lane], index[LAST, lane] = start[row], bounds[r], bounds[r + 1] - 1
-        state[LENGTH, lane] = length[r]
-        for j in range(theta.shape[2]):
-            th[j, lane] = theta[copy, group[row], j]
-        for j in used:
-            p[j, lane] = phi[driver, j]
 
 
 @inlined
@@ -119,33 +95,6 @@ def advance(index, state, moved, t):
 
 
 @compiled
-def push(signals, index, state, t, pulse):
-    """Load the pulses of now."""
-    for lane in range(LANES):
-        begin, end, change, added = pulse[index[COPY, lane]]
-        now = signals[index[SAMPLE, lane], 19] if begin <= t < end else 0.0
-        state[PULSE, lane], state[PUSH, lane] = change * now, added * now
-
-
-@compiled
-def keep(signals, index, state, t, n, gap_out, speed_out):
-    """Keep a sample."""
-    for lane in range(LANES):
-        copy, row, i = index[COPY, lane], index[ROW, lane], min(index[ORIGIN, lane] + t, index[LAST, lane])
-        gap_out[copy, row, n] = signals[i, 0] - state[POSITION, lane]
-        speed_out[copy, row, n] = state[SPEED, lane]
-
-
-@compiled
-def remember(index, memory, moved, wound, t, begins):
-    """Fill the memories of drivers who are where they begin: as they are ``wound``, or as ``beginning`` has them."""
-    for lane in range(LANES):
-        if t <= begins or index[ORIGIN, lane] + t <= index[FIRST, lane]:
-            for j in range(MEMORIES):
-                memory[j, lane] = wound[index[COPY, lane], index[ROW, lane], j] if wound.size else moved[3 + j, lane]
-
-
-@compiled
 def march(
     signals, bounds, record, start, group, length, theta, phi, flags, used, seen, tables, back, dt, k, lead, steps,
     every, pulse, ends, order, settle, wound, gap_out, speed_out, begin, end,
@@ -164,16 +113,14 @@ def march(
     Where there are ``ends``, ``wound`` [copies, rows, memories] is filled instead: a lane goes through a record from
     its beginning to ``start``, for rows ``order[ends[i] : ends[i + 1]]``, which begin at the samples ``settle`` [rows].
     """
-    index, state = np.zeros((8, LANES), np.int64), np.zeros((COLUMN + signals.shape[1], LANES))
+    index, state = np.zeros((10, LANES), np.int64), np.zeros((COLUMN + signals.shape[1], LANES))
     th, p, c = np.empty((theta.shape[2], LANES)), np.zeros((phi.shape[1], LANES)), np.empty((CONSTANTS, LANES))
     memory, moved, winds = np.zeros((MEMORIES, LANES)), np.zeros((3 + MEMORIES, LANES)), len(ends) > 0
     ready = wound[:0] if winds else wound
     for tile in range(begin, end):
-        seat(tile, index, state, p, th, record, start, group, length, bounds, theta, phi, used)
+        seat(tile, index, state, p, th, record, start, group, length, bounds, theta, phi, used, ends)
         constants(phi, p, th, k, c, flags)
-        following = ends[index[ROW]] if winds else index[ROW]
-        since = index[ORIGIN] - index[FIRST]
-        begins = -since.max() if winds else -lead
+        begins = -index[SPAN, 1] if winds else -lead
         h = np.empty((steps + back - begins if back > 0 else 1, SIGNALS, LANES))
         for t in range(begins - back, steps):
             now = t - begins + back
@@ -188,16 +135,11 @@ def march(
                 continue
             if t <= 0:
                 hold(signals, index, state, moved, t, 0 if winds else begins)
-            if t <= max(begins, -since.min()):
+            if t <= max(begins, -index[SPAN, 0]):
                 beginning(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
                 remember(index, memory, moved, ready, t, begins)
             if winds:
-                for lane in range(LANES):
-                    stop = ends[index[ROW, lane] + 1]
-                    while following[lane] < stop and settle[order[following[lane]]] == index[ORIGIN, lane] + t:
-                        for j in range(MEMORIES):
-                            wound[index[COPY, lane], order[following[lane]], j] = memory[j, lane]
-                        following[lane] += 1
+                wind_up(index, memory, wound, t, ends, order, settle)
                 wind(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
                 continue
             respond(signals, index, now, state, h, phi, p, th, k, c, flags, tables, memory, moved)
