@@ -35,8 +35,9 @@ def drawn(names: list[str]) -> page.Block:
 
 
 def test_names_in_scripts_of_the_default_font_are_drawn_without_a_warning() -> None:
-    """DejaVu has Cyrillic and Arabic."""
-    assert drawn(["Москва", "شارع", "plain"]).text == "Names."
+    """DejaVu has Cyrillic and Arabic; signs that no font has, such as a tab, are drawn as spaces."""
+    assert drawn(["Москва", "شارع", "plain", "a\tb\x01"]).text == "Names."
+    assert drawn(["a\tb\x01"]).text == "Names."
 
 
 def test_a_name_that_the_default_font_lacks_is_drawn_with_one_that_has_it(monkeypatch: pytest.MonkeyPatch) -> None:

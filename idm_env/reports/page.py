@@ -27,6 +27,9 @@ NEXT |= dict.fromkeys(("filter", "reconstruct"), "fit {out}/trajectories.parquet
 NEXT |= dict.fromkeys(("fit", "each"), "explain {data}") | dict.fromkeys(("explain", "demo", "drift"), _SIMULATE)
 """Next command by command: "lost" of one without a model, "raw" of a fit to noisy positions."""
 
+CONTROL = dict.fromkeys((*range(10), *range(11, 32), 127), " ")
+"""What no font draws, but for the end of a line, is drawn as a space."""
+
 
 class Asked(NamedTuple):
     """Command line of a user: the command, its files, and the options of reading them."""
@@ -127,8 +130,15 @@ def legible(figure: Figure) -> None:
     from matplotlib.font_manager import FontProperties, findfont, fontManager, get_font
     from matplotlib.text import Text
 
-    ticks = [label for panel in figure.axes for axis in (panel.xaxis, panel.yaxis) for label in axis.get_ticklabels()]
+    axes = [axis for panel in figure.axes for axis in (panel.xaxis, panel.yaxis)]
+    for axis in axes:
+        words = [label.get_text() for label in axis.get_ticklabels()]
+        if words != (plain := [word.translate(CONTROL) for word in words]):
+            axis.set_ticklabels(plain)
+    ticks = [label for axis in axes for label in axis.get_ticklabels()]
     texts = [*ticks, *(text for text in figure.findobj(Text) if isinstance(text, Text))]
+    for text in texts:
+        text.set_text(text.get_text().translate(CONTROL))
     lacking = {ord(c) for text in texts for c in text.get_text() if not c.isspace()}
     lacking -= get_font(findfont(FontProperties())).get_charmap().keys()
     families = list(rcParams["font.family"])
