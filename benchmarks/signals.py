@@ -218,7 +218,7 @@ def trained(seed: int, steps: int, **keywords: Any) -> tuple[Policy, float]:
 
 
 def main(
-    inflow: float = 300.0, network: str = "grid 5x5", search_seconds: float = 30.0, steps: int = 400_000,
+    inflow: float = 300.0, network: str = "grid 5x5", search_seconds: float = 30.0, steps: int = 300_000,
     seeds: int = 5, episodes: int = EPISODES, sumo: int = 0,
 ) -> None:  # fmt: skip
     """Delay per vehicle of rules and of PPO, on the same fresh episodes."""

@@ -65,7 +65,7 @@ class SignalsTask:
 
     Args:
         network: ``"grid 5x5"`` (rows × columns), a SUMO ``.net.xml``, or a ``Network``.
-        trips: A SUMO ``.rou.xml`` for that file, or None: vehicles arrive at random where links begin.
+        trips: A SUMO ``.rou.xml`` of that network's edges, or None: vehicles arrive at random where links begin.
         inflow: Vehicles per hour and entry where there are no ``trips``.
         turns: Shares of those who turn left, go on and turn right. On one lane few who wait for a gap to turn left stop
             all behind them.
@@ -124,15 +124,16 @@ class SignalsTask:
 
     @cached_property
     def _read(self) -> tuple[Network, Demand | None]:
-        if isinstance(self.network, Network):
-            return self.network, None
-        words = str(self.network).split()
-        if words[:1] == ["grid"]:
+        network = self.network
+        if not isinstance(network, Network):
+            words = str(network).split()
             sides = words[1].split("x") if len(words) == 2 else []
-            if len(sides) != 2 or not all(side.isdecimal() and 0 < int(side) < 100 for side in sides):
-                raise ValueError(f"network = {shown(self.network)} must be such as 'grid 5x5', 1 to 99 each way.")
-            return Network.grid(int(sides[0]), int(sides[1])), None
-        network = Network.from_sumo(self.network)
+            if words[:1] != ["grid"]:
+                network = Network.from_sumo(network)
+            elif len(sides) == 2 and all(side.isdecimal() and 0 < int(side) < 100 for side in sides):
+                network = Network.grid(int(sides[0]), int(sides[1]))
+            else:
+                raise ValueError(f"network = {shown(network)} must be such as 'grid 5x5', 1 to 99 each way.")
         return network, None if self.trips is None else Demand.from_sumo(network, self.trips, end=self.duration)
 
     @cached_property

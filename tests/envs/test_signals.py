@@ -1,6 +1,7 @@
 """Signals as agents: rules of lights, books of vehicles, rows of batches, and the faces that people bring."""
 
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -209,6 +210,21 @@ def test_what_cannot_be_is_told_in_one_line(keywords: dict[str, Any], message: s
         SignalsEnv(**{**SMALL, **keywords})
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_trips_of_a_file_drive_on_any_network(tmp_path: Path) -> None:
+    """On a grid by its name, too; a file of another network's edges is refused."""
+    path = tmp_path / "my.rou.xml"
+    path.write_text('<routes><flow id="f" from="left0A0" to="B0right0" begin="0" end="60" number="7"/></routes>')
+    env = vector(1, trips=path)
+    env.reset(seed=1)
+    info: dict[str, Any] = {}
+    for _ in range(39):
+        info = env.step(None)[-1]
+    assert env.task.vehicles == 7 and info["arrived"] + info["inside"] == 7
+    path.write_text(path.read_text().replace("left0A0", "nowhere"))
+    with pytest.raises(ValueError, match="edge 'nowhere' has no lane for cars here"):
+        vector(1, trips=path)
 
 
 def test_actions_that_are_none() -> None:
