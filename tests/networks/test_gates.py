@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -153,6 +154,23 @@ def test_all_paths_do_the_same() -> None:
     )
     single, _ = simulator.rollout(single, {}, params, 104, keep=None)
     assert torch.equal(single.position, place.position[1]) and torch.equal(single.gap, place.gap[1])
+
+
+def test_a_mirrored_network_is_mirrored_traffic() -> None:
+    """Who keeps to the right keeps to the left, and left turns are right turns: every number stays, bit by bit."""
+    network = Network.grid(1, 2)
+    shape = tuple(points * (-1.0, 1.0) for points in network.shape)
+    mirrored = replace(network, shape=shape, left=network.right, right=network.left)
+    turns = (0.3, 0.5, 0.2)
+    ends = []
+    for road, shares in ((network, turns), (mirrored, turns[::-1]), (mirrored, turns)):
+        simulator, params = simulated(road)
+        demand = Demand.by_turns(road, 600.0, 120.0, seed=2, shares=shares)
+        state = travelling(simulator, demand, params, dtype=torch.float64)
+        ends.append(simulator.rollout(state, {}, params, 1500, keep=None)[0])
+        assert int(counts(ends[-1]).left) > 30
+    same(ends[0], ends[1], True)
+    assert not torch.equal(ends[0].speed, ends[2].speed)
 
 
 def test_any_effect_works_on_a_network() -> None:
