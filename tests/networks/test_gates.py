@@ -13,9 +13,11 @@ import torch
 
 from idm_env import IDM, Brakes, Simulator
 from idm_env.backends import off
+from idm_env.compiled.kernels import network_loops
 from idm_env.effects import LinkLimit, Noise, StopLine
+from idm_env.multilane import junctions
 from idm_env.multilane.junctions import by_link, counts, deadlocked, journeys_of, showing, travelling
-from idm_env.roads.network import Network, Plan, padded
+from idm_env.roads.network import AMBER, GREEN, RED, YIELD, Network, Plan, padded
 from idm_env.roads.network_demand import Demand
 from idm_env.roads.ways import Ways
 from idm_env.types import State
@@ -198,6 +200,13 @@ def test_an_agent_may_hold_a_signal() -> None:
     assert int(links.queued[0]) + int(links.vehicles[0]) == 40
     state, _ = simulator.rollout(showing(state, torch.tensor([0])), {}, params, 1500, keep=None)
     assert int(counts(state).left) == 40
+
+
+def test_codes_are_those_of_the_compiled_loops() -> None:
+    """They stand twice, because compiled code is kept by what stands beside it alone."""
+    assert [getattr(network_loops, k) for k in ("RED", "GREEN", "AMBER", "YIELD")] == [RED, GREEN, AMBER, YIELD]
+    loops = network_loops.LED, network_loops.CAME, network_loops.CAME_BEHIND
+    assert loops == (junctions.LED, junctions.ENTERED, junctions.ENTERED_BEHIND)
 
 
 def test_a_network_needs_somebody_who_obeys() -> None:

@@ -385,8 +385,7 @@ def is_shut(i, m, room, sizes, car, tag, road, site, move, against, routes, rule
     """
     square, yields = car[W * i + SPEED] * car[W * i + SPEED], against[(sizes[MOVES] + m) * sizes[AGAINST]] >= 0
     can_stop, clears = tag[W * i + TOLD] > FREE or square * rules[BRAKING] <= room, tag[W * i + TOLD] == CLEARS
-    closed = is_closed(m, move)
-    if can_stop and closed and not clears:
+    if can_stop and not clears and is_closed(m, move):
         return True
     if yields and move[K * m + SHOWN] == YIELD and tag[W * i + TOLD] == STOPS and room < rules[SIGHT]:
         tag[W * i + TOLD] = CLEARS
