@@ -48,7 +48,7 @@ def measured() -> Callable[[str], Path]:
     return find
 
 
-LONG = ("test_discover", "test_bases", "test_wheel", "test_examples", "test_docs")
+LONG = ("test_discover", "test_bases", "test_traps", "test_cli", "test_wheel", "test_examples", "test_docs")
 """Files that take a minute each: they are begun first, so that none of them is waited for in the end."""
 
 
