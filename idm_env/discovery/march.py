@@ -23,6 +23,7 @@ import numpy as np
 
 from idm_env import delay_buffer, effects as known
 from idm_env.compiled.kernels import record_lanes, threads
+from idm_env.compiled.kernels.record_lanes import COLUMNS as COLUMNS
 from idm_env.compiled.records import march_loops
 from idm_env.compiled.scalar import library
 from idm_env.compiled.scalar.graph import Leaf, TimeStep
@@ -46,12 +47,6 @@ PULSE, PAST = "pulse", "past"
 """Slots of a pulse, and of the one curve over a feature of the past that a model can have."""
 PULSED = ("acceleration", "time_gap", "desired_speed", "accel_and_decel")
 """What a short pulse can change."""
-
-COLUMNS: tuple[str, ...] = ("lead_rear", "lead_speed", "lead_accel")
-COLUMNS += ("second_rear", "second_speed", "second_accel", "second_present")
-COLUMNS += ("behind_front", "behind_speed", "behind_accel", "behind_present")
-COLUMNS += ("beside_distance", "beside_speed", "beside_present")
-COLUMNS += ("position", "speed", "accel", "time", "place", "pushed")
 
 
 def _column(name: str) -> str:

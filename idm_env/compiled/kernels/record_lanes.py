@@ -16,6 +16,13 @@ with needed("a compiled loop"):
     from idm_env.compiled.kernels.compiler import apart, compiler
 
 LANES = 8
+COLUMNS: tuple[str, ...] = ("lead_rear", "lead_speed", "lead_accel", "second_rear", "second_speed", "second_accel")
+COLUMNS += ("second_present", "behind_front", "behind_speed", "behind_accel", "behind_present", "beside_distance")
+COLUMNS += ("beside_speed", "beside_present", "position", "speed", "accel", "time", "place", "pushed")
+"""What a record has of every sample; of others, the distance to them or where they are."""
+MEASURED_REAR, MEASURED_LEAD_SPEED, MEASURED_LEAD_ACCEL = range(3)
+MEASURED_POSITION, MEASURED_SPEED, MEASURED_ACCEL, MEASURED_TIME, MEASURED_PLACE, MEASURED_PUSH = range(14, 20)
+"""The columns that every loop reads."""
 SPEED, ACCEL, DISPLACEMENT, POSITION, GAP, LENGTH, LEAD_SPEED, LEAD_ACCEL, STEP, PLACE, PULSE, OFFSET, PUSH = range(13)
 """Rows of ``state``; the first three those of ``moved``, memories at the beginning behind them."""
 COLUMN = 13
@@ -50,7 +57,7 @@ def push(signals, index, state, t, pulse):
     """Load the pulses of now."""
     for lane in range(LANES):
         begin, end, change, added = pulse[index[COPY, lane]]
-        now = signals[index[SAMPLE, lane], 19] if begin <= t < end else 0.0
+        now = signals[index[SAMPLE, lane], MEASURED_PUSH] if begin <= t < end else 0.0
         state[PULSE, lane], state[PUSH, lane] = change * now, added * now
 
 
@@ -59,7 +66,7 @@ def keep(signals, index, state, t, n, gap_out, speed_out):
     """Keep a sample."""
     for lane in range(LANES):
         copy, row, i = index[COPY, lane], index[ROW, lane], min(index[ORIGIN, lane] + t, index[LAST, lane])
-        gap_out[copy, row, n] = signals[i, 0] - state[POSITION, lane]
+        gap_out[copy, row, n] = signals[i, MEASURED_REAR] - state[POSITION, lane]
         speed_out[copy, row, n] = state[SPEED, lane]
 
 
@@ -98,8 +105,7 @@ def column(signals, sample, number):
 @compiler()
 def curve(phi, driver, number, tables, x):
     """Piecewise linear through evenly spaced knots (periodic where a period is given), or a trapezoid."""
-    form, count, place = tables[number, 0], tables[number, 1], np.uint64(tables[number, 2])
-    row = np.uint64(driver)
+    form, count, place, row = tables[number, 0], tables[number, 1], np.uint64(tables[number, 2]), np.uint64(driver)
     first, by, period = phi[row, place], phi[row, place + np.uint64(1)], phi[row, place + np.uint64(3)]
     knots = place + np.uint64(4)
     if period > 0.0:

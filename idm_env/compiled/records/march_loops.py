@@ -62,15 +62,16 @@ def look(signals, index, state, seen, many, t, per_dt):
 
     ``seen`` are the columns of others that somebody reads, so many.
     """
-    sample = larger(index[ORIGIN] + t, index[FIRST])
-    sample = smaller(sample, index[LAST])
+    sample = smaller(larger(index[ORIGIN] + t, index[FIRST]), index[LAST])
     index[SAMPLE] = sample
     if t <= 0:
-        state[POSITION], state[SPEED] = column(signals, sample, 14), column(signals, sample, 15)
-        state[OFFSET] = column(signals, sample, 18) - state[POSITION]
-    state[GAP] = column(signals, sample, 0) - state[POSITION]
-    state[LEAD_SPEED], state[LEAD_ACCEL] = column(signals, sample, 1), column(signals, sample, 2)
-    state[STEP] = column(signals, sample, 17) * per_dt
+        state[POSITION] = column(signals, sample, MEASURED_POSITION)
+        state[SPEED] = column(signals, sample, MEASURED_SPEED)
+        state[OFFSET] = column(signals, sample, MEASURED_PLACE) - state[POSITION]
+    state[GAP] = column(signals, sample, MEASURED_REAR) - state[POSITION]
+    state[LEAD_SPEED] = column(signals, sample, MEASURED_LEAD_SPEED)
+    state[LEAD_ACCEL] = column(signals, sample, MEASURED_LEAD_ACCEL)
+    state[STEP] = column(signals, sample, MEASURED_TIME) * per_dt
     state[PLACE] = state[POSITION] + state[OFFSET]
     for j in range(many):
         state[COLUMN + seen[j]] = column(signals, sample, seen[j])
@@ -79,7 +80,7 @@ def look(signals, index, state, seen, many, t, per_dt):
 @inlined
 def hold(signals, index, state, moved, t, until):
     """Load accelerations: measured ones up to step ``until`` and where a record begins, after that the drivers' own."""
-    measured = column(signals, index[SAMPLE], 16)
+    measured = column(signals, index[SAMPLE], MEASURED_ACCEL)
     state[ACCEL] = measured if index[ORIGIN] + t <= index[FIRST] else moved[ACCEL]
     if t <= until:
         state[ACCEL] = measured
