@@ -89,9 +89,7 @@ def drift(trajectories: Trajectories) -> float:
     if any(r.kind == "speed estimated" for r in trajectories.repairs):
         return 0.0
     table = with_step(trajectories)
-    leaders = table.select(
-        "run_id", "step", pl.col("vehicle_id").alias("leader_id"), pl.col("speed_mps").alias("lead_speed")
-    )
+    leaders = table.select("run_id", "step", leader_id="vehicle_id", lead_speed="speed_mps")
     both = table.filter(pl.col("gap_measured") & pl.col("gap_m").is_finite()).join(
         leaders, on=["run_id", "leader_id", "step"], how="inner", maintain_order="left"
     )

@@ -88,20 +88,22 @@ def finished(
     if before is not None:
         laws = bases.compared(decided.null.model, before, evaluation.of_law, evaluation.seed, on_law)
     least = judge.least_m(evaluation.records)
+    scored = evaluation.records if evaluation.test is None else evaluation.test
+    floor = ceilings.floor(scored, ceilings.drift(trajectories))
     if judgement.is_exact(least):
         judgement = replace(judgement, added=False, refusal=judgement.refusal or Refusal(Reason.SMALL_SIZE, least))
     elif laws:
         evaluation, decided, judgement, last = _on_the_best((evaluation, decided, judgement, last), laws, searched)
         if evaluation.adapt and judgement.of_all is not None:
-            judgement = judgement.split(fleet.found(laws, judgement.of_all, of_laws.among, evaluation.seed))
+            kinds = fleet.found(laws, judgement.of_all, of_laws.among, evaluation.seed)
+            if kinds is None or kinds.column or _stand_out(laws, of_laws, floor["horizon_rmse_m"]):
+                judgement = judgement.split(kinds)
     null, prepared, problem = decided.null, evaluation.records, evaluation.searching.problem
     first, before = evaluation.of_null
     final = judgement.compared if judgement.added and judgement.compared is not None else null
     everywhere = judge.windowed(prepared, problem, final)
     if not judgement.is_exact(least):
         judgement = replace(judgement, shared=shared.find(places.respond(*everywhere), evaluation.seed))
-    scored = prepared if evaluation.test is None else evaluation.test
-    floor = ceilings.floor(scored, ceilings.drift(trajectories))
     if evaluation.adapt and before is not None:
         pooled = evaluation.judged(null, pooled=True)[1]
         ladder = judgement.climbed(prepared, pooled, floor["horizon_rmse_m"])
@@ -129,6 +131,12 @@ def finished(
     result = replace(result, rolled={file: one for file, one in rolls.items() if one is not None})
     shown = null if judgement.compared is None else judgement.compared
     return Discovery(result, models, prepared, null, shown, problem, decided.rounds, judgement)
+
+
+def _stand_out(laws: list[bases.Law], of_laws: Evaluation, noise_m: float) -> bool:
+    """Tell whether two laws for drivers gain more than where all have the null's, with their own residuals."""
+    problem, null = judge.windowed(of_laws.records, of_laws.searching.problem, of_laws.null)
+    return replica.stands_out(problem, null, noise_m, of_laws.seed, fleet.gain_of_two(laws, null.values))
 
 
 Found = tuple[Evaluation, Decided, Judgement, Solution]

@@ -7,13 +7,15 @@ from itertools import combinations
 
 import numpy as np
 
-from idm_env.discovery import judge, result
+from idm_env.discovery import crossed, judge, result
 from idm_env.discovery.bases import LEAST, Law
+from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.compare import ERRORS, Comparison, changes, compare
 from idm_env.discovery.crossed import in_blocks
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import windows
+from idm_env.discovery.solve import Problem
 from idm_env.discovery.verdict import improves, mean_ratio
 
 COLUMNS = ("vehicle_class", "acc_run", "driver", "kind")
@@ -76,7 +78,7 @@ def found(laws: Iterable[Law], one: Judged, among: Among, seed: int) -> Kinds | 
         among: Judges a model for the drivers of some records [records].
         seed: Of the bootstrap.
     """
-    fair = [law for law in laws if not (law.own or law.model.catalogue.without)]
+    fair = _whole(laws)
     if len(fair) < 2:
         return None
     logs = np.stack([_logs(law.errors) for law in fair])
@@ -86,19 +88,16 @@ def found(laws: Iterable[Law], one: Judged, among: Among, seed: int) -> Kinds | 
         if len(each) < 2:
             continue
         own = _of_kinds(fair, which, among)
-        if not all(_is_better(compare(other, own, seed)) for other in (_of_kinds(fair, which, among, null=True), one)):
+        against = compare(one, own, seed)
+        # As an addition must hold, and by ``LEAST``.
+        each_change = against, compare(_of_kinds(fair, which, among, null=True), own, seed)
+        if not all(improves(errors) and mean_ratio(errors) < 1.0 - LEAST for errors in each_change):
             continue
         sure = (which[0] == which[1]) & np.isin(which[0], each)
         group = np.where(sure, np.searchsorted(each, which[0]), logs.sum(1)[each].argmin(0))
         classes = () if kind is None else tuple(tuple(np.unique(kind[group == g])) for g in range(len(each)))
-        against = compare(one, own, seed)
         return Kinds([fair[i] for i in each], group, own, one, against, column, classes, int(sure.sum()))
     return None
-
-
-def _is_better(against: Mapping[str, Comparison]) -> bool:
-    """Tell whether errors hold as those of an addition must, and are lower by ``LEAST``."""
-    return improves(against) and mean_ratio(against) < 1.0 - LEAST
 
 
 def _by_kind(logs: np.ndarray, kind: np.ndarray) -> np.ndarray:
@@ -120,12 +119,44 @@ def _by_errors(logs: np.ndarray) -> np.ndarray:
     Of two laws each; those two are taken by which the drivers' errors are least. All have the null's law where that is
     not less by ``LEAST`` than with one law for all.
     """
+    which, left = _best_pair(logs)
+    return which if left <= logs.mean((1, 2)).min() + np.log(1.0 - LEAST) else np.zeros_like(which)
+
+
+def _best_pair(logs: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the laws of the two by which drivers err least [halves, followers], and the mean of ``logs`` by these."""
     pairs = [np.array(pair) for pair in combinations(range(len(logs)), 2)]
     which = [pair[logs[pair].argmin(0)][::-1] for pair in pairs]
     left = [float(np.take_along_axis(logs, w[None], 0).mean()) for w in which]
-    if min(left) > logs.mean((1, 2)).min() + np.log(1.0 - LEAST):
-        return np.zeros_like(which[0])
-    return which[int(np.argmin(left))]
+    return which[int(np.argmin(left))], min(left)
+
+
+def _whole(laws: Iterable[Law]) -> list[Law]:
+    return [law for law in laws if not (law.own or law.model.catalogue.without)]
+
+
+def gain_of_two(laws: Iterable[Law], values: np.ndarray) -> Callable[[Problem], float]:
+    """Return a statistic of windows: the fall of log RMSE 5 s ahead by two laws, one a driver, beside one for all.
+
+    Every half of a driver's blocks is predicted by what the other half says. φ is ``values`` [Q].
+    """
+    models = [law.model for law in _whole(laws)]
+
+    def logs(problem: Problem, model: Hypothesis) -> np.ndarray:
+        rows, own = problem.rows, replace(problem, prior=first_prior(model.catalogue.own))
+        centre, one_fold = np.tile(own.prior.centre, (own.groups, 1)), np.zeros(len(rows.records.runs), int)
+        halves = crossed.Halves.split(rows.records, model, values[None], one_fold)
+        theta = crossed.whitened(own, halves, model.fixed(values), one_fold, centre)
+        square = crossed.predicted(own, halves, theta)[:, -1] ** 2
+        half = rows.group + own.groups * (rows.block % 2)
+        total, count = (np.bincount(half, x, 2 * own.groups).reshape(2, -1) for x in (square, None))
+        return np.asarray(0.5 * np.log((total + 1e-9) / np.maximum(count, 1)))
+
+    def gain(problem: Problem) -> float:
+        every = np.stack([logs(problem, model) for model in models])
+        return float(every.mean((1, 2)).min() - _best_pair(every)[1])
+
+    return gain
 
 
 def _sides(judged: Judged, which: np.ndarray, column: str) -> list[int]:

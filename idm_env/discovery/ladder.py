@@ -204,12 +204,8 @@ def _crps(rows: Rows, error: np.ndarray) -> float:
     ``σ (z (2 Φ(z) − 1) + 2 φ(z) − 1/√π)`` with ``z = error / σ`` (Gneiting and Raftery 2007). All drivers' width counts
     as four windows of each one's own.
     """
-    half, total = rows.block % 2, np.zeros((2, int(rows.group.max()) + 1))
-    count = np.zeros_like(total)
-    np.add.at(total, (half, rows.group), error**2)
-    np.add.at(count, (half, rows.group), 1.0)
-    others = 1 - half, rows.group
-    wide = np.sqrt((total[others] + 4.0 * np.mean(error**2)) / (count[others] + 4.0)) + 1e-9
+    total, count = _other_half(rows, error**2)
+    wide = np.sqrt((total + 4.0 * np.mean(error**2)) / (count + 4.0)) + 1e-9
     z = error / wide
     return float(np.mean(wide * (z * (2.0 * normal.cdf(z) - 1.0) + 2.0 * normal.pdf(z) - np.pi**-0.5)))
 
@@ -242,17 +238,15 @@ def dependences(rows: Rows, error: np.ndarray, seed: int) -> tuple[Dependence, .
     folds = ridge.coefficients.shape[1]
     if folds < 2:
         return ()
-    curves, some, wide = [], scene[:: len(scene) // SCENES + 1], student.ppf(0.975, folds - 1) * np.sqrt(folds - 1)
+    each, some, wide = [], scene[:: len(scene) // SCENES + 1], student.ppf(0.975, folds - 1) * np.sqrt(folds - 1)
     for column, (name, unit, back) in enumerate(COORDINATES):
         points = np.repeat(some[None], POINTS, axis=0)
         points[:, :, column] = (grid := np.linspace(ends[0, column], ends[1, column], POINTS))[:, None]
         mean = smooth(points.reshape(-1, scene.shape[1])).reshape(POINTS, len(some), -1).mean(1)
-        each = ridge.at(np.hstack([usual, mean]))
-        effect, width = each.mean(1), wide * each.std(1)
-        curves.append(
-            Dependence(name, unit, *(x.tolist() for x in (back(grid), effect, effect - width, effect + width)))
-        )
-    return tuple(curves)
+        folded = ridge.at(np.hstack([usual, mean]))
+        effect, width = folded.mean(1), wide * folded.std(1)
+        each.append(Dependence(name, unit, *(x.tolist() for x in (back(grid), effect, effect - width, effect + width))))
+    return tuple(each)
 
 
 def _beside_drift(rows: Rows, error: np.ndarray) -> np.ndarray:
@@ -264,14 +258,15 @@ def _drift(rows: Rows, error: np.ndarray) -> np.ndarray:
     """Return what a driver's other errors tell of his drift [W, 3]: the last two, and the other blocks' mean."""
     one = np.append(0.0, error[:-1]) * rows.joined
     two = np.append(0.0, one[:-1]) * rows.joined
-    half = rows.block % 2
-    other = np.zeros(len(rows))
-    for part in (0, 1):
-        total = np.bincount(rows.group, error * (half == part))
-        count = np.bincount(rows.group, (half == part).astype(float))
-        mean = (total / np.maximum(count, 1.0))[rows.group]
-        other = np.where(half == 1 - part, mean, other)
-    return np.stack([one, two, other], axis=1)
+    total, count = _other_half(rows, error)
+    return np.stack([one, two, total / np.maximum(count, 1.0)], axis=1)
+
+
+def _other_half(rows: Rows, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sum of values [W], and their number, over the half of the driver's blocks that is not a window's."""
+    half, size = 2 * rows.group + rows.block % 2, 2 * int(rows.group.max()) + 2
+    total, count = np.bincount(half, values, size), np.bincount(half, minlength=size)
+    return total[half ^ 1], count[half ^ 1]
 
 
 def _scene(rows: Rows) -> np.ndarray:
@@ -307,11 +302,8 @@ def _share(rows: Rows, before: np.ndarray, after: np.ndarray, whole: np.ndarray)
     share = float(gained.sum() / total.sum())
     each = np.bincount(unit, gained - share * total)[np.unique(unit)]
     count = len(each)
-    width = (
-        student.ppf(0.975, count - 1) * np.sqrt((each**2).sum() * count / (count - 1)) / total.sum()
-        if count > 1
-        else np.inf
-    )
+    wide = student.ppf(0.975, count - 1) * np.sqrt((each**2).sum() * count / max(count - 1, 1))
+    width = wide / total.sum() if count > 1 else np.inf
     return Share(share, float(share - width), float(share + width))
 
 

@@ -32,6 +32,8 @@ DRAWS, ENOUGH = 39, 3
 """Replicas for a likeness, and how many that look as structured as the data are enough (Besag and Clifford 1991)."""
 CLEAR, MOST = 99, 199
 """Replicas after which none such is refusal enough, and replicas at most, of what claims that something is missing."""
+FEW = 19
+"""Replicas that must all be smaller where one costs a fit of every law: p ≤ 0.05."""
 BLOCK_S = 30.0
 """Length of a block of a driver's own residuals: 10 s cut a memory of 5 s."""
 FEATURES = 40
@@ -160,6 +162,20 @@ def _fitted(
     """Return the windows of a replica, and log θ [G, P] of drivers fitted to it in them."""
     replica = replace(problem, rows=windows(drivers.drive(problem.rows.records, random, noise_m)))
     return replica, solve(replica, drivers.model, drivers.theta, EMPTY[0], iterations=3).theta
+
+
+def stands_out(
+    problem: Problem, solution: Solution, noise_m: float, seed: int, statistic: Callable[[Problem], float]
+) -> bool:
+    """Tell whether a statistic of windows is larger than in all of ``FEW`` replicas with drivers' own residuals.
+
+    Noise alone passes once in twenty times, and as a rule is told by the first replicas.
+    """
+    theta, random = solution.theta, np.random.default_rng(seed)
+    bare = NoisyDrivers(solution.model.fixed(solution.values), theta, np.ones(len(theta)), 1.0)
+    drivers, mine = _own_noise(problem, solution, bare, noise_m), statistic(problem)
+    driven = (drivers.drive(problem.rows.records, random, noise_m) for _ in range(FEW))
+    return all(statistic(replace(problem, rows=windows(records))) < mine for records in driven)
 
 
 def ahead(problem: Problem, theta: np.ndarray, model: Hypothesis) -> np.ndarray:

@@ -346,8 +346,7 @@ def _delete(searching: Search, final: Solution, base: int) -> Solution:
         now, intervals = held_out(searching.problem, final), interval_of(final, searching.problem)
         losses = []
         for index in range(base, len(final.model.terms)):
-            begin = sum(t.size for t in final.model.terms[:index])
-            keep = np.delete(final.values, np.arange(begin, begin + final.model.terms[index].size))
+            keep = np.delete(final.values, final.model.where(final.model.terms[index].label))
             less = solve(searching.problem, final.model.without(index), final.theta, keep)
             loss = float(log_gain(held_out(searching.problem, less), now).mean())
             losses.append((min(loss, 0.0) if together.contains_null(final, intervals, index) else loss, index, less))

@@ -183,13 +183,9 @@ def unsure(ladder: Ladder | None, refusal: Refusal) -> tuple[Verdict, Refusal]:
 
 def _strengths(first: Round, problem: Problem) -> dict[str, Strength]:
     """Return by name what the first round says of the strengths of effects that have one."""
-    strengths = {}
-    for s in first.scored:
-        if s.solution is not None and s.term.effect is not None and s.term.effect in ALL:
-            strength = strength_of(s.solution, problem, s.term.label)
-            if strength is not None:
-                strengths[s.term.effect] = strength
-    return strengths
+    fitted = [(s.term, s.solution) for s in first.scored if s.solution is not None]
+    each = {t.effect: strength_of(one, problem, t.label) for t, one in fitted if t.effect in ALL}
+    return {name: strength for name, strength in each.items() if name is not None and strength is not None}
 
 
 def _nearest(judged: Judgement, terms: list[result.TermFinding], first: Round) -> result.Nearest | None:
@@ -206,11 +202,8 @@ def _drivers(before: judge.Judged | None, after: judge.Judged | None) -> list[re
     """Return every held-out driver once, however many pieces the record has."""
     if before is None or after is None:
         return []
-    return [
-        result.DriverError("/".join(name), float(b), float(a))
-        for name, b, a in zip(before.followers, before.gap_rmse, after.gap_rmse, strict=True)
-        if np.isfinite(b)
-    ]
+    each = zip(before.followers, before.gap_rmse, after.gap_rmse, strict=True)
+    return [result.DriverError("/".join(name), float(b), float(a)) for name, b, a in each if np.isfinite(b)]
 
 
 def _where(term: Term, values: dict[str, float]) -> result.Location:
@@ -236,11 +229,8 @@ def _findings(
     intervals = interval_of(compared, problem) if judged.intervals is None else judged.intervals
     fold = crossed.folds_of(problem.rows.records.runs, (), judged.seed)
     law = judged.null.model.catalogue.base.title
-    findings, begin = [], sum(t.size for t in judged.null.model.terms)
-    for term in judged.terms:
-        findings.append(_finding(term, compared, rounds, intervals[begin : begin + term.size], problem, law, fold))
-        begin += term.size
-    return findings
+    each = [(term, compared, rounds, intervals[compared.model.where(term.label)]) for term in judged.terms]
+    return [_finding(*one, problem, law, fold) for one in each]
 
 
 def _finding(
@@ -289,13 +279,9 @@ def _known(final: Solution, intervals: np.ndarray, base: int) -> list[result.Giv
 
 def candidates_of(rounds: Sequence[Round], refused: dict[str, str]) -> list[result.Candidate]:
     """Return every candidate of every round, best first, then those ``refused`` by name and why."""
-    rows = [
-        _candidate(number, this, int(i)) for number, this in enumerate(rounds, 1) for i in np.argsort(-this.tested.gain)
-    ]
-    return rows + [
-        result.Candidate(0, None, name, True, None, None, (None, None), None, {}, {}, reason)
-        for name, reason in refused.items()
-    ]
+    rows = [_candidate(n, this, int(i)) for n, this in enumerate(rounds, 1) for i in np.argsort(-this.tested.gain)]
+    more = [result.Candidate(0, None, n, True, None, None, (None, None), None, {}, {}, r) for n, r in refused.items()]
+    return rows + more
 
 
 def _candidate(number: int, this: Round, i: int) -> result.Candidate:
@@ -332,11 +318,9 @@ def _parameters(before: Solution, after: Solution, seen: np.ndarray) -> list[res
     spreads = []
     for s in (before, after):
         values, errors = np.exp(s.theta[seen]), standard_errors(s)[seen]
-        spreads.append([
-            result.Spread(float(np.median(v)), float(np.quantile(v, 0.1)), float(np.quantile(v, 0.9)),
-                   float(np.median(e * v)))
-            for v, e in zip(values.T, errors.T, strict=True)
-        ])  # fmt: skip
+        columns = zip(values.T, errors.T, strict=True)
+        each = [(np.median(v), *np.quantile(v, (0.1, 0.9)), np.median(e * v)) for v, e in columns]
+        spreads.append([result.Spread(*map(float, one)) for one in each])
     names = [p.name for p in before.model.catalogue.own]
     return [result.Moved(*row) for row in zip(names, *spreads, strict=False)]
 

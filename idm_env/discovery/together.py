@@ -50,8 +50,7 @@ def untried(searching: Search, at: ClosedLoopFit) -> list[Term]:
     have = {t.effect for t in at.model.terms}
     late = any(ALL[name].latency for name in have if name is not None)
     effects = [searching.base.catalogue.by_name[n] for n in searching.names if n not in have]
-    simple = [e for e in effects if e.sought == "anywhere" and not (late and ALL[e.name].latency)]
-    return [terms.simple(e) for e in simple]
+    return [terms.simple(e) for e in effects if e.sought == "anywhere" and not (late and ALL[e.name].latency)]
 
 
 def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple[Joined | None, list[Step]]:
@@ -88,8 +87,7 @@ def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple
 def _forward(searching: Search, fit: ClosedLoopFit, seed: int) -> tuple[Step, Solution | None]:
     candidates = untried(searching, fit)
     if not candidates:
-        nothing = np.zeros(0)
-        return Step([], Tested(nothing, nothing, np.zeros((0, 2)))), None
+        return Step([], Tested(np.zeros(0), np.zeros(0), np.zeros((0, 2)))), None
     gains, starts = zip(*(closed_loop.linear_screen(fit, term) for term in candidates), strict=True)
     scored = [Scored(term, None, gain) for term, gain in zip(candidates, gains, strict=True)]
 
@@ -124,8 +122,7 @@ def _backward(start: ClosedLoopFit, solution: Solution, base: int) -> Solution:
 
 
 def _without(start: ClosedLoopFit, solution: Solution, index: int) -> Solution:
-    begin = sum(t.size for t in solution.model.terms[:index])
-    gone = np.arange(begin, begin + solution.model.terms[index].size)
+    gone = solution.model.where(solution.model.terms[index].label)
     fit = replace(start, theta=solution.theta)
     return closed_loop.joint(fit, solution.model.without(index), np.delete(solution.values, gone))
 
@@ -139,10 +136,9 @@ def is_too_short(solution: Solution, added: Sequence[Term], dt: float) -> bool:
 def contains_null(solution: Solution, intervals: np.ndarray, index: int) -> bool:
     """Tell whether the interval of a term's strength, in ``intervals`` [Q, 3], contains its null; a curve has none."""
     term = solution.model.terms[index]
-    begin = sum(t.size for t in solution.model.terms[:index])
     strengths = [(p, i) for i, p in enumerate(term.parameters) if p.role == "strength" and p.null is not None]
     if len(strengths) != 1:
         return False
     parameter, entry = strengths[0]
-    _, low, high = intervals[begin + entry]
+    _, low, high = intervals[solution.model.where(term.label)][entry]
     return bool(low <= parameter.null <= high)

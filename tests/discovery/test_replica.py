@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from benchmarks import undeclared
 from idm_env.data import Trajectories, episodes, hidden, synthetic
-from idm_env.discovery import judge, replica
+from idm_env.discovery import fleet, judge, replica
+from idm_env.discovery.bases import Law
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.ladder import FORESEEN, LEVEL
+from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis, curve, simple
 from idm_env.discovery.noise import first_noise
 from idm_env.discovery.records import gather, windows
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import LEAST_GAIN
 from idm_env.discovery.solve import Problem, Solution
+from idm_env.effects import base_named
+from tests.discovery.conftest import Mixing
 
 
 def fitted(seed: int, ou: float, runs: int = 8, seconds: float = 120.0) -> tuple[Problem, Solution]:
@@ -47,6 +53,37 @@ def test_noise_of_drivers_is_that_of_the_data_and_what_it_leaves_agrees(ou: floa
     assert told.pop("past").share < FORESEEN
     for one in told.values():
         assert not one.is_refused and one.p_value >= 0.05 and one.replicas >= replica.ENOUGH
+
+
+def test_own_residuals_come_in_blocks_and_leave_drivers_as_unlike_as_they_are() -> None:
+    """Drivers are spread until those fitted to a replica are, whom their population pulls together once more."""
+    problem, found = fitted(5, 0.2)
+    records, theta = problem.rows.records, found.theta
+    bare = replica.NoisyDrivers(found.model.fixed(found.values), theta, np.ones(len(theta)), 1.0)
+    steps = tuple(np.arange(0.0, 1e4, 1.0) for _ in theta)
+    drawn = np.diff(replace(bare, own=steps)._noise(records, 0, np.random.default_rng(0)))
+    assert np.flatnonzero(drawn != 1.0).tolist() == [299, 599, 899, 1199], "blocks of 30 s of one driver's residuals"
+    own, errors = replica._own_noise(problem, found, bare, floor_of(problem)), []
+    for seed in range(4):
+        replicas, fitted_again = replica._fitted(problem, own, np.random.default_rng(seed), floor_of(problem))
+        errors.append(np.median(np.abs(replica.ahead(replicas, fitted_again, own.model))))
+        spread = [replica._spread(x)[1] for x in (theta, fitted_again)]
+        assert np.median(spread[1] / spread[0]) == pytest.approx(1.0, abs=0.35)
+    assert np.mean(errors) == pytest.approx(np.median(np.abs(replica.ahead(problem, theta, own.model))), rel=0.2)
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_kinds_of_drivers_gain_more_than_their_noise_alone(
+    mixed: bool, kinds: Mixing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Drivers of much noise are predicted better by a law that answers less, although all are IDM."""
+    kinds(np.add.outer(np.arange(8), np.arange(2)) % 2 == (1 if mixed else 2))
+    monkeypatch.setattr(replica, "FEW", 5)
+    problem, found = fitted_to(synthetic.generate(31, runs=8, followers=2, seconds=90.0, ou=0.1)[0])
+    models = [Hypothesis((), Catalogue((), base_named(name), located=False)) for name in ("idm", "constant_time_gap")]
+    laws = [Law(model.catalogue.base, model, None, {}) for model in models]  # type: ignore[arg-type]
+    gain = fleet.gain_of_two(laws, found.values)
+    assert replica.stands_out(problem, found, floor_of(problem), 0, gain) is mixed
 
 
 def test_noise_gains_a_candidate_as_much_in_replicas() -> None:

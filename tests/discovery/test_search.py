@@ -41,6 +41,15 @@ def made(seed: int, **choices: object) -> Records:
     return gather(list(episodes(trajectories, smooth=True, min_seconds=12.0)))
 
 
+def test_a_pair_that_cancels_is_fitted_from_strong_starts() -> None:
+    """Strong starts make errors larger at first, and a fit of one step ended where it gained nothing."""
+    records = made(941001, effect={"delay": 0.5, "leader_acceleration": 0.4}, runs=5, followers=2, seconds=90.0)
+    searching, null = begun(records, "delay", "leader_acceleration")
+    pair = searching.pair(null, ("delay", "leader_acceleration"), held_out(searching.problem, null), 1)
+    assert pair.solution is not None and pair.gains.mean() > 0.1
+    assert pair.solution.values.tolist() == pytest.approx([0.5, 0.4], rel=0.15)
+
+
 def test_a_time_is_found_although_its_scan_ends_a_bin_off() -> None:
     """Drivers' own parameters make up for a wrong time, so that between two bins the cost has a local minimum."""
     searching, null = begun(made(90150, effect="regime_shift"), "regime_shift")
