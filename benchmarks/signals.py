@@ -223,6 +223,8 @@ def main(
 ) -> None:  # fmt: skip
     """Delay per vehicle of rules and of PPO, on the same fresh episodes."""
     keywords: dict[str, Any] = {"network": network, "inflow": inflow}
+    if sumo and network != "grid 5x5":
+        raise SystemExit(f"--sumo {sumo} drives netgenerate's grid, and not '{network}'. Use --network 'grid 5x5'.")
     about, random = machine(), np.random.default_rng(0)
     print(f"Delay per vehicle, {network}, {inflow:g} veh/h an entry ({about['processor']}, {about['date']})\n")
     never: Policy = lambda env, seen: None  # noqa: E731
