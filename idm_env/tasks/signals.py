@@ -116,6 +116,8 @@ class SignalsTask:
             raise ValueError(f"amber = {self.amber:g} s must be at most hold = {self.hold:g} s.")
         for name in {*(self.randomise or {})} - {"inflow"}:
             raise ValueError(f"randomise.{shown(name)} cannot be drawn in task 'signals', where inflow can.")
+        if self.trips is not None and (self.randomise or self.inflow != SignalsTask.inflow):
+            raise ValueError(f"trips = {shown(self.trips)} are all who arrive. Leave out inflow and randomise.")
         if not self.agents:
             raise ValueError(f"network = {shown(self.network)} has no signal with two phases. Give one that has.")
         _ = self.simulator, self.inflows

@@ -202,6 +202,8 @@ def test_faces() -> None:
         ({"reward": "wait"}, "reward = 'wait' is unknown."),
         ({"randomise": {"turns": [0, 1]}}, "randomise.'turns' cannot be drawn in task 'signals', where inflow can."),
         ({"inflow": -1.0}, "inflow = -1 veh/h"),
+        ({"trips": "a.rou.xml", "inflow": 500.0}, "trips = 'a.rou.xml' are all who arrive. Leave out inflow"),
+        ({"trips": "a.rou.xml", "randomise": {"inflow": [1, 2]}}, "are all who arrive. Leave out inflow and"),
         ({"network": Network.roundabout()}, "has no signal with two phases. Give one that has."),
     ],
 )  # fmt: skip
@@ -216,7 +218,7 @@ def test_trips_of_a_file_drive_on_any_network(tmp_path: Path) -> None:
     """On a grid by its name, too; a file of another network's edges is refused."""
     path = tmp_path / "my.rou.xml"
     path.write_text('<routes><flow id="f" from="left0A0" to="B0right0" begin="0" end="60" number="7"/></routes>')
-    env = vector(1, trips=path)
+    env = vector(1, trips=path, inflow=300.0)
     env.reset(seed=1)
     info: dict[str, Any] = {}
     for _ in range(39):
@@ -224,7 +226,7 @@ def test_trips_of_a_file_drive_on_any_network(tmp_path: Path) -> None:
     assert env.task.vehicles == 7 and info["arrived"] + info["inside"] == 7
     path.write_text(path.read_text().replace("left0A0", "nowhere"))
     with pytest.raises(ValueError, match="edge 'nowhere' has no lane for cars here"):
-        vector(1, trips=path)
+        vector(1, trips=path, inflow=300.0)
 
 
 def test_actions_that_are_none() -> None:
