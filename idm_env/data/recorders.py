@@ -55,23 +55,23 @@ def clock_offsets(trajectories: Trajectories) -> dict[tuple[str, str], float]:
     few = counts.filter(pl.col("count") <= MOST_DRIVERS).sort("run_id")
     some = few.filter(pl.col("count").cum_sum() <= MOST_DRIVERS)["run_id"].to_list()
     measured = bool(trajectories.table["gap_measured"].any())
-    errors = (_rate_errors, _rate_errors) if measured else (_response_errors, partial(_response_errors, second=True))
+    of_shifts: Callable[[Episode, np.ndarray], np.ndarray] = _rate_errors if measured else _response_errors
     items = _long_episodes(trajectories, some, not measured)
     by_track = {(e.run_id, e.vehicle_id): i for i, e in enumerate(items)}
     ahead = [(i, by_track[e.run_id, e.leader_id]) for i, e in enumerate(items) if (e.run_id, e.leader_id) in by_track]
     if len(ahead) < LEAST_PAIRS or items[0].dt > HALF_S:
         return {}
     i, j = np.array(ahead).T
-    whole, first, last = np.array([[_shift(e, p, errors[0]) for p in _parts(e)] for e in items]).T
+    whole, first, last = np.array([[_shift(e, p, of_shifts) for p in _parts(e)] for e in items]).T
     opposite, lasting = np.corrcoef(whole[i], whole[j])[0, 1], np.corrcoef(first, last)[0, 1]
-    sides = min(whole.max(), -whole.min(), spread := whole.std())
-    if sides < LEAST_SPREAD_S or opposite > OPPOSITE or lasting < LASTING:
+    if min(whole.max(), -whole.min(), whole.std()) < LEAST_SPREAD_S or opposite > OPPOSITE or lasting < LASTING:
         return {}
-    second = np.array([_shift(e, _parts(e)[0], errors[1]) for e in items])
-    if np.corrcoef(second[i], second[j])[0, 1] > 0.0 or second.std() < 0.5 * spread:
-        return {}
+    if not measured:  # what a second leader foretells moves answers, and no rates
+        second = np.array([_shift(e, _parts(e)[0], partial(_response_errors, second=True)) for e in items])
+        if np.corrcoef(second[i], second[j])[0, 1] > 0.0 or second.std() < 0.5 * whole.std():
+            return {}
     items = _long_episodes(trajectories, few["run_id"].to_list(), not measured)
-    single = [_shift(e, _parts(e)[0], errors[0]) for e in items]
+    single = [_shift(e, _parts(e)[0], of_shifts) for e in items]
     shifts = {(e.run_id, e.vehicle_id): (e.leader_id, _usual(items, single, e)) for e in items}
     return {track: _offset(shifts, *track) for track in shifts}
 

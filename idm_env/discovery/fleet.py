@@ -89,15 +89,18 @@ def found(laws: Iterable[Law], one: Judged, among: Among, seed: int) -> Kinds | 
             continue
         own = _of_kinds(fair, which, among)
         against = compare(one, own, seed)
-        # As an addition must hold, and by ``LEAST``.
-        each_change = against, compare(_of_kinds(fair, which, among, null=True), own, seed)
-        if not all(improves(errors) and mean_ratio(errors) < 1.0 - LEAST for errors in each_change):
+        if not (_is_better(against) and _is_better(compare(_of_kinds(fair, which, among, null=True), own, seed))):
             continue
         sure = (which[0] == which[1]) & np.isin(which[0], each)
         group = np.where(sure, np.searchsorted(each, which[0]), logs.sum(1)[each].argmin(0))
         classes = () if kind is None else tuple(tuple(np.unique(kind[group == g])) for g in range(len(each)))
         return Kinds([fair[i] for i in each], group, own, one, against, column, classes, int(sure.sum()))
     return None
+
+
+def _is_better(against: Mapping[str, Comparison]) -> bool:
+    """Tell whether errors hold as those of an addition must, and are lower by ``LEAST``."""
+    return improves(against) and mean_ratio(against) < 1.0 - LEAST
 
 
 def _by_kind(logs: np.ndarray, kind: np.ndarray) -> np.ndarray:
