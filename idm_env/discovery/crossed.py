@@ -57,8 +57,8 @@ class Halves:
     @classmethod
     def split(cls, records: Records, model: Hypothesis, values: np.ndarray, fold: np.ndarray) -> "Halves":
         """Return the halves of records whose runs have a ``fold`` [runs], and the model with its ``values``."""
-        size, twice = len(records.signals), (np.tile(x, 2) for x in (fold[records.run], records.group))
-        each = np.stack([next(twice), np.repeat([0, 1], len(records)), next(twice)])
+        size, half = len(records.signals), np.repeat([0, 1], len(records))
+        each = np.stack([np.tile(fold[records.run], 2), half, np.tile(records.group, 2)])
         keys, group = np.unique(each, axis=1, return_inverse=True)
         doubled = replace(
             records, episodes=2 * records.episodes, signals=np.tile(records.signals, (2, 1)), group=group.ravel(),

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from idm_env import effects as catalogue
 from idm_env.data import Trajectories, episodes
 from idm_env.data.recorders import on_one_clock
 from idm_env.discovery import calibrate, judge, march, model as terms, noise, records, search
@@ -22,7 +21,8 @@ from idm_env.discovery.search import Search
 from idm_env.discovery.selection import Decided, decide
 from idm_env.discovery.solve import Problem
 from idm_env.discovery.write import write_search
-from idm_env.effects import ALL, CANDIDATES, PACKAGED, CarFollowing, Effect, base_named, candidates, make, register
+from idm_env.effects import ALL, CANDIDATES, PACKAGED, base_named, candidates, make, named, register
+from idm_env.effects.base import CarFollowing, Effect
 from idm_env.fitting.fit import refuse_nan
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, silent
@@ -122,7 +122,7 @@ def _chosen(effects: Sequence[str | Effect | type[Effect]] | None, null_effects:
     chosen: list[Effect] = []
     for candidate in candidates() if effects is None else effects:
         if isinstance(candidate, str):
-            name = catalogue.named(candidate)
+            name = named(candidate)
         else:
             name = register(candidate if isinstance(candidate, type) else type(candidate)).kind
         if name not in candidates():

@@ -26,8 +26,8 @@ from idm_env.multilane.junctions import counts, travelling
 from idm_env.roads import Demand
 from tests.networks.laws import broken
 
-KINDS = ("-j traffic_light", "--tls.guess --tls.guess.threshold 20", "-j priority") * 2
-KINDS = (*KINDS[:5], "-j right_before_left")
+SIGNALS, GUESSED = "-j traffic_light", "--tls.guess --tls.guess.threshold 20"
+KINDS = SIGNALS, GUESSED, "-j priority", SIGNALS, GUESSED, "-j right_before_left"
 CAR: dict[str, float] = {"max_accel": 2.6, "comfort_decel": 4.5, "time_gap": 1.0, "min_gap": 2.5}
 SECONDS = 600
 

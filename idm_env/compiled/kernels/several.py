@@ -36,9 +36,8 @@ def between(simulator: Simulator) -> Simulator:
     if inner is None:
         effects = (Remembering(e) if e.hook == "change" else e for e in simulator.effects)
         still = tuple(e for e in effects if not isinstance(e, Remembering) or e.of.remembers)
-        inner = dataclasses.replace(
-            simulator, road=Chains(isinstance(simulator.road, Lanes) and simulator.road.closed), effects=still
-        )
+        closed = isinstance(simulator.road, Lanes) and simulator.road.closed
+        inner = dataclasses.replace(simulator, road=Chains(closed), effects=still)
         simulator.__dict__["_between"] = inner
     return inner
 
