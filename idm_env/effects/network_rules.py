@@ -53,9 +53,10 @@ class StopLine(Effect):
 
     Where his next line is, and whether it is closed to him, a driver on a network is told ``every`` so many seconds
     (``multilane.junctions``): it is his memory (m on his link). It is closed for red and amber, if he can stop, ``v² ≤
-    2 b_m s_line``, and did not wait there for a gap in green; while a foe is inside or has reserved; without room
-    behind the junction; and to drivers who yield while they are more than ``sight`` (m) away, or somebody with
-    priority arrives within t_c (``critical_gap``, s).
+    2 b_m s_line``, and did not wait there for a gap in green; while a foe is inside or has reserved, and will not
+    have left before one must stop; without room behind the junction; and to drivers who yield while they are more than
+    ``sight`` (m) away, or somebody with priority arrives within t_c (``critical_gap``, s): SUMO's 1 s beyond the time
+    that a left turn takes from a stand.
     Lines and leaders are looked for within ``reach`` (m), or v²/2b_m if that is more.
     """
 
@@ -65,7 +66,7 @@ class StopLine(Effect):
     title = "stop lines"
     equation = "A += −a max(0, (s*/s)²_line − (s*/s)²_leader)"
     most_decel: float = 3.0
-    critical_gap: float = 4.0
+    critical_gap: float = 5.5
     sight: float = 4.5
     reach: float = 150.0
     every: float = 0.5

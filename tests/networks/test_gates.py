@@ -94,6 +94,22 @@ def test_as_many_pass_in_a_green_as_in_sumo(green: float, vehicles: int) -> None
     assert np.diff(passed)[2:].tolist() == [vehicles] * 4
 
 
+def test_two_of_each_stream_pass_in_five_seconds_as_in_sumo() -> None:
+    """Nobody waits at green for a foe who will have left the junction when he is at his line."""
+    network = Network.crossing(arm=300.0, green=5.0)
+    simulator, params = simulated(network, max_accel=1.5, comfort_decel=2.0, time_gap=1.5, min_gap=2.0)
+    ways, n = Ways(network), 100
+    streets = ("bottom0A0", "A0top0"), ("top0A0", "A0bottom0"), ("left0A0", "A0right0"), ("right0A0", "A0left0")
+    routes = [ways.route_along(street, "") for street in streets]
+    demand = Demand(padded(routes), [*range(4)] * n, np.arange(4 * n) // 4)
+    state, passed = travelling(simulator, demand, params, dtype=torch.float64), []
+    for _ in range(3):
+        state, _ = simulator.rollout(state, {}, params, 640, keep=None)
+        journeys = journeys_of(state)
+        passed.append(torch.bincount(journeys.route[journeys.left >= 0].long(), minlength=4))
+    assert (passed[2] - passed[1]).tolist() == [8] * 4
+
+
 def test_one_turns_left_after_each_green() -> None:
     """Oncoming traffic leaves no gap. SUMO lets 1.0 a cycle clear the junction when it has ended."""
     network = Network.crossing(arm=300.0)

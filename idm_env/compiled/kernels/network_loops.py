@@ -391,7 +391,7 @@ def is_shut(i, m, room, sizes, car, tag, road, site, move, against, routes, rule
         tag[W * i + TOLD] = CLEARS
     for q in range(sizes[AGAINST]):
         f = against[m * sizes[AGAINST] + q]
-        if f >= 0 and move[K * f + INSIDE] > 0:
+        if f >= 0 and is_in_the_way(i, f, room, sizes, car, tag, road, move, routes, rules):
             tag[W * i + WAITS] = move[K * f + HOLDER]
             return True
         if f >= 0 and not clears and move[K * f + COMING] > 0 and is_closed(f, move):
@@ -411,6 +411,24 @@ def is_shut(i, m, room, sizes, car, tag, road, site, move, against, routes, rule
         and against[m * sizes[AGAINST]] >= 0
         and not has_room(i, m, sizes, car, tag, road, site, move, routes, driver)
     )
+
+
+@exact
+def is_in_the_way(i, f, room, sizes, car, tag, road, move, routes, rules):
+    """Whether somebody is inside on a foe's move, or has reserved it, and will not have left it in time at his speed.
+
+    That is before a vehicle must decide to stop. Until then it reserves nothing: a wrong guess lets no foes meet.
+    """
+    inside, j, v = move[K * f + INSIDE], move[K * f + HOLDER], car[W * i + SPEED]
+    spare = room - v * v * rules[BRAKING] - v * rules[EVERY] - rules[MORE]
+    if inside != 1 or spare <= 0:
+        return inside > 0
+    way, h, k = car[W * j + LENGTH] - car[W * j + POSITION], tag[W * j + HOP], tag[W * j + LINK]
+    while k >= 0 and k != move[K * f + END]:
+        way += road[K * k + LONG]
+        h += 1
+        k = next_link(j, h, sizes[WIDE], tag, routes)
+    return (way + car[W * j + SPEED] * rules[EVERY]) * max(v, STANDS) > spare * car[W * j + SPEED]
 
 
 @exact
