@@ -35,7 +35,7 @@ from benchmarks import command, table
 from benchmarks.bench.measure import machine
 from benchmarks.bench.peers import started
 from benchmarks.networks import GRID, generated, network_of, routes_xml
-from idm_env.envs.signal_faces import SignalsVectorEnv
+from idm_env.envs.network_faces import NetworkVectorEnv
 from idm_env.multilane.junctions import by_link, journeys_of
 from idm_env.roads.network_demand import Demand
 from idm_env.tasks.signals import SignalsTask, World
@@ -46,15 +46,15 @@ PPO: dict[str, Any] = {
     "n_steps": 45, "batch_size": 450, "n_epochs": 5, "gamma": 0.95, "gae_lambda": 0.9, "ent_coef": 0.002,
 }  # fmt: skip
 """What PPO is given beside SB3's defaults; its learning rate falls from 1e-3. A step is 5 s: γ looks 100 s ahead."""
-Policy = Callable[[SignalsVectorEnv, np.ndarray], Any]
+Policy = Callable[[NetworkVectorEnv, np.ndarray], Any]
 
 
-def made(count: int, **keywords: Any) -> SignalsVectorEnv:
+def made(count: int, **keywords: Any) -> NetworkVectorEnv:
     """Return that many worlds."""
     return gymnasium.make_vec("DiffIDM-v0", count, task="signals", **keywords)  # type: ignore[return-value]
 
 
-def delays(env: SignalsVectorEnv, policy: Policy, seed: int) -> np.ndarray:
+def delays(env: NetworkVectorEnv, policy: Policy, seed: int) -> np.ndarray:
     """Return the delay per vehicle of an episode in each world (s)."""
     seen, _ = env.reset(seed=seed)
     lost: Any = 0.0
@@ -65,7 +65,7 @@ def delays(env: SignalsVectorEnv, policy: Policy, seed: int) -> np.ndarray:
     return lost / np.maximum(figures["inside"] + figures["waiting"] + figures["arrived"], 1)
 
 
-def served(env: SignalsVectorEnv) -> tuple[np.ndarray, np.ndarray]:
+def served(env: NetworkVectorEnv) -> tuple[np.ndarray, np.ndarray]:
     """Return which links lead to green, and from it, in each phase of each agent ``(S, P, L)``."""
     task, net = env.task, env.task.road
     shape = len(task.agents), int(task.counts.max()), len(net.names)
@@ -86,7 +86,7 @@ def weighed(weights: Any) -> Policy:
     weights = np.atleast_2d(weights)
     masks: list[Any] = []
 
-    def choose(env: SignalsVectorEnv, seen: np.ndarray) -> np.ndarray:
+    def choose(env: NetworkVectorEnv, seen: np.ndarray) -> np.ndarray:
         if not masks:
             masks.extend(served(env))
         world = env.worlds.world
@@ -210,7 +210,7 @@ def trained(seed: int, steps: int, **keywords: Any) -> tuple[Policy, float]:
     agent.learn(steps)
     scaled.training = False
 
-    def choose(env: SignalsVectorEnv, seen: np.ndarray) -> np.ndarray:
+    def choose(env: NetworkVectorEnv, seen: np.ndarray) -> np.ndarray:
         rows = scaled.normalize_obs(seen.reshape(-1, env.task.features))
         return agent.predict(rows, deterministic=True)[0].reshape(len(seen), -1)
 

@@ -43,7 +43,8 @@ def _register() -> None:
     """Register the environment ids; entry points are text, so that nothing heavy is imported here."""
     from gymnasium.envs.registration import register, registry
 
-    for name, keywords in {"DiffIDM-v0": {}, **{_task_id(t): {"task": t} for t in (*_TASKS, "signals")}}.items():
+    tasks = {_task_id(t): {"task": t} for t in (*_TASKS, "signals", "junction")}
+    for name, keywords in {"DiffIDM-v0": {}, **tasks}.items():
         if name not in registry:
             register(
                 id=name,

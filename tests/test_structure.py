@@ -216,8 +216,9 @@ NETWORKS = (
     *(f"compiled/kernels/{name}.py" for name in ("networks", "network_loops", "network_rows")),
     *(f"roads/{name}.py" for name in ("network", "network_demand", "journeys", "streets", "ways")),
     *(f"roads/sumo_{name}.py" for name in ("demand", "files", "network")),
-    *("multilane/junctions.py", "fitting/network_job.py", "tasks/signals.py"),
-    *(f"envs/{name}.py" for name in ("faces", "signal_faces")),
+    *(f"tasks/{name}.py" for name in ("network_task", "signals", "junction")),
+    *("multilane/junctions.py", "fitting/network_job.py"),
+    *(f"envs/{name}.py" for name in ("faces", "network_faces")),
     "effects/network_rules.py",
 )
 """Files that networks of roads brought."""

@@ -1,24 +1,25 @@
-"""Entry points of Gymnasium: the environment of a task, whose agents are vehicles or signals."""
+"""Entry points of Gymnasium: the environment of a task, on a road or on a network."""
 
 from typing import Any
 
 from gymnasium import Env
 from gymnasium.vector import VectorEnv
 
-from idm_env.tasks.signals import SignalsTask
+NETWORKS = ("signals", "junction")
+"""Tasks on networks."""
 
 
 def single(task: Any = None, **keywords: Any) -> Env:
-    """Return one environment: a ``DiffIDMEnv``, or a ``SignalsEnv`` for task ``signals``."""
+    """Return one environment: a ``DiffIDMEnv``, or a ``NetworkEnv`` for tasks on networks."""
     from idm_env.envs.gym import DiffIDMEnv
-    from idm_env.envs.signal_faces import SignalsEnv
+    from idm_env.envs.network_faces import NetworkEnv
 
-    return SignalsEnv(**keywords) if task == SignalsTask.name else DiffIDMEnv(task=task, **keywords)
+    return (NetworkEnv if task in NETWORKS else DiffIDMEnv)(task=task, **keywords)
 
 
 def vector(task: Any = None, **keywords: Any) -> VectorEnv:
-    """Return a vector: a ``DiffIDMVectorEnv``, or a ``SignalsVectorEnv`` for task ``signals``."""
-    from idm_env.envs.signal_faces import SignalsVectorEnv
+    """Return a vector: a ``DiffIDMVectorEnv``, or a ``NetworkVectorEnv`` for tasks on networks."""
+    from idm_env.envs.network_faces import NetworkVectorEnv
     from idm_env.envs.vector import DiffIDMVectorEnv
 
-    return SignalsVectorEnv(**keywords) if task == SignalsTask.name else DiffIDMVectorEnv(task=task, **keywords)
+    return (NetworkVectorEnv if task in NETWORKS else DiffIDMVectorEnv)(task=task, **keywords)

@@ -25,10 +25,9 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 from idm_env.envs.batch import Batch, Outcome
 from idm_env.envs.gym import Pictures
 from idm_env.envs.info import ids
+from idm_env.envs.network_faces import KINDS, network_parallel_env
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
-from idm_env.envs.signal_faces import signals_parallel_env
 from idm_env.envs.spaces import action_of, action_space, numpy_dtype, observation_box
-from idm_env.tasks.signals import SignalsTask
 from idm_env.validation import shown, whole
 
 _SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0
@@ -60,9 +59,9 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
     }
 
     def __new__(cls, **keywords: Any) -> Any:
-        """Return the environment of a task: of ``signals`` one whose agents are signals."""
-        if keywords.pop("task", None) == SignalsTask.name:
-            return signals_parallel_env(**keywords)
+        """Return the environment of a task: of ``signals`` and ``junction`` that of networks."""
+        if keywords.get("task") in KINDS:
+            return network_parallel_env(**keywords)
         return super().__new__(cls)
 
     def __init__(

@@ -374,33 +374,11 @@ def _check_plans(net: Network) -> None:
 
 
 def _circles(after: Mapping[int, set[int]]) -> list[list[int]]:
-    """Return the parts of a graph within which everything leads to everything else, those of more than one (Tarjan)."""
-    low: dict[int, int] = {}
-    stack: list[int] = []
-    circles: list[list[int]] = []
-    for root in after:
-        if root in low:
-            continue
-        path = [(root, iter(after[root]))]
-        begin = {root: len(low)}
-        low[root] = len(low)
-        stack.append(root)
-        while path:
-            node, rest = path[-1]
-            for other in rest:
-                if other not in low:
-                    begin[other] = low[other] = len(low)
-                    stack.append(other)
-                    path.append((other, iter(after[other])))
-                    break
-                if other in stack:
-                    low[node] = min(low[node], low[other])
-            else:
-                path.pop()
-                if path:
-                    low[path[-1][0]] = min(low[path[-1][0]], low[node])
-                if low[node] == begin[node]:
-                    part = stack[stack.index(node) :]
-                    del stack[stack.index(node) :]
-                    circles += [sorted(part)] if len(part) > 1 else []
-    return circles
+    """Return the parts of a graph within which everything leads to everything else, those of more than one."""
+    from scipy.sparse import coo_array, csgraph  # takes a second
+
+    pairs = np.array([(a, b) for a, others in after.items() for b in others], int).reshape(-1, 2)
+    n = max(after, default=-1) + 1
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (n, n))
+    parts = csgraph.connected_components(graph, connection="strong")[1] if n else np.zeros(0)
+    return [np.flatnonzero(parts == k).tolist() for k in np.flatnonzero(np.bincount(parts.astype(int)) > 1)]

@@ -10,31 +10,21 @@ Shapes: B worlds, N vehicles, L links, S agents, F features of the widest agent;
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 
-from idm_env.effects import IDM, Brakes, Effect, LinkLimit, StopLine
-from idm_env.multilane.junctions import HALTING, NEVER, journeys_of, of_kinds, showing, travelling
-from idm_env.roads.network import Array, Network, padded
-from idm_env.roads.network_demand import Demand
-from idm_env.roads.ways import Ways, keyed
-from idm_env.simulator import Simulator
-from idm_env.tasks.behaviour import Behaviour, behaviour
-from idm_env.tasks.checks import Range, in_ranges, two_ends
+from idm_env.multilane.junctions import showing
+from idm_env.roads.network import Array, Network
+from idm_env.tasks.checks import Range
+from idm_env.tasks.network_task import Here, NetworkStep, NetworkTask, present_in
 from idm_env.tasks.random import Draw
-from idm_env.types import Journeys, State, mapped
-from idm_env.validation import one_of, shown
-
-REWARDS = ("unit", "delay", "queue", "pressure")
-_ROUTES = 256
-"""Routes from each entry, drawn once, among which every vehicle chooses."""
+from idm_env.types import State
+from idm_env.validation import shown
 
 
 class World(NamedTuple):
@@ -45,22 +35,8 @@ class World(NamedTuple):
     since: Array
 
 
-class SignalStep(NamedTuple):
-    """Rewards of a step (B, S), and for each world (B) the time lost in it (s) and numbers of vehicles after it.
-
-    ``lost`` is the time of all vehicles, those who wait to enter included, less what their way takes at the limits.
-    """
-
-    reward: Array
-    lost: Array
-    inside: Array
-    waiting: Array
-    halting: Array
-    arrived: Array
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SignalsTask:
+class SignalsTask(NetworkTask):
     """Signals of a network as agents.
 
     Args:
@@ -85,58 +61,27 @@ class SignalsTask:
         ValueError: In one line, with value, rule and cure.
     """
 
-    network: str | Path | Network = "grid 5x5"
-    trips: str | Path | None = None
-    inflow: float = 300.0
-    turns: tuple[float, float, float] = (0.0, 0.8, 0.2)
-    duration: float = 900.0
-    hold: float = 5.0
     least_green: float = 10.0
     amber: float = 3.0
-    effects: str | Sequence[str | Mapping[str, Any] | Effect] = ()
-    parameters: Mapping[str, Any] | None = None
-    dt: float | None = None
-    randomise: Mapping[str, Any] | None = None
-    reward: str = "unit"
 
     name: ClassVar[str] = "signals"
+    rewards: ClassVar[tuple[str, ...]] = ("unit", "delay", "queue", "pressure")
+    control: ClassVar[str] = "signals"
     ranges: ClassVar[Mapping[str, Range]] = {
-        "inflow": Range(0.0, 3600.0, "veh/h"),
-        "duration": Range(1.0, 86_400.0, "s"),
-        "hold": Range(0.5, 600.0, "s"),
+        **NetworkTask.ranges,
         "least_green": Range(0.0, 600.0, "s"),
         "amber": Range(0.0, 60.0, "s"),
-        "dt": Range(1e-3, 1.0, "s"),
     }
 
     def __post_init__(self) -> None:
-        in_ranges(self)
-        one_of("reward", self.reward, REWARDS)
+        super().__post_init__()
         if self.amber > self.hold:
             raise ValueError(f"amber = {self.amber:g} s must be at most hold = {self.hold:g} s.")
-        for name in {*(self.randomise or {})} - {"inflow"}:
-            raise ValueError(f"randomise.{shown(name)} cannot be drawn in task 'signals', where inflow can.")
-        if self.trips is not None and (self.randomise or self.inflow != SignalsTask.inflow):
-            raise ValueError(f"trips = {shown(self.trips)} are all who arrive. Leave out inflow and randomise.")
         if not self.agents:
             raise ValueError(f"network = {shown(self.network)} has no signal with two phases. Give one that has.")
         _ = self.simulator, self.inflows
 
     # -- static facts ------------------------------------------------------------------------------------------------
-
-    @cached_property
-    def _read(self) -> tuple[Network, Demand | None]:
-        network = self.network
-        if not isinstance(network, Network):
-            words = str(network).split()
-            sides = words[1].split("x") if len(words) == 2 else []
-            if words[:1] != ["grid"]:
-                network = Network.from_sumo(network)
-            elif len(sides) == 2 and all(side.isdecimal() and 0 < int(side) < 100 for side in sides):
-                network = Network.grid(int(sides[0]), int(sides[1]))
-            else:
-                raise ValueError(f"network = {shown(network)} must be such as 'grid 5x5', 1 to 99 each way.")
-        return network, None if self.trips is None else Demand.from_sumo(network, self.trips, end=self.duration)
 
     @cached_property
     def phases(self) -> tuple[tuple[str, ...], ...]:
@@ -157,7 +102,7 @@ class SignalsTask:
         return tuple(self._read[0].plans[s].name for s in self.agents)
 
     @cached_property
-    def counts(self) -> Array:
+    def counts(self) -> Array:  # type: ignore[override]
         """Number of phases of each agent (S)."""
         return np.array([len(self.phases[s]) for s in self.agents])
 
@@ -196,76 +141,6 @@ class SignalsTask:
             behind[net.end[moves]] = k
         return before, behind
 
-    @cached_property
-    def behaviour(self) -> Behaviour:
-        """The drivers, who know limits and lines."""
-        own = (IDM(), LinkLimit(), StopLine(), Brakes())
-        return behaviour(own, (), {}, self.effects, self.parameters, self.dt, None)
-
-    @cached_property
-    def simulator(self) -> Simulator:
-        """The simulator of this task."""
-        return Simulator(self.road, self.behaviour.effects, self.behaviour.dt, self.behaviour.integration)
-
-    @cached_property
-    def params(self) -> dict[str, dict[str, torch.Tensor]]:
-        """The parameters of all drivers."""
-        values = of_kinds(self.behaviour.params(self.vehicles, torch.float32, "cpu"), self._demand)
-        self.simulator.check(values)
-        return values
-
-    @property
-    def horizon(self) -> int:
-        """Steps of an episode."""
-        return max(1, round(self.duration / self.hold))
-
-    @cached_property
-    def inflows(self) -> tuple[float, float]:
-        """Least and most inflow of an episode (vehicles per hour and entry)."""
-        low, high = two_ends("randomise.inflow", (self.randomise or {}).get("inflow", (self.inflow,) * 2))
-        for end in (low, high):
-            self.ranges["inflow"].check("randomise.inflow", end)
-        return low, high
-
-    @cached_property
-    def vehicles(self) -> int:
-        """Slots: as many as arrive at most, but for once in 10⁹ episodes."""
-        if self._read[1] is not None:
-            return len(self._read[1].route)
-        mean = self.inflows[1] * self.duration / 3600.0 * len(self.entries)
-        return math.ceil(mean + 6.0 * math.sqrt(mean)) + 1
-
-    @cached_property
-    def _ways(self) -> Ways:
-        return Ways(self.road)
-
-    @property
-    def entries(self) -> list[int]:
-        """Links at which vehicles arrive."""
-        return list(self._ways.entries.values())
-
-    @cached_property
-    def _demand(self) -> Demand:
-        """The demand of a file, or slots for arrivals, and the routes among which each chooses."""
-        if self._read[1] is not None:
-            return self._read[1]
-        # As many routes of every entry as of any other: whoever arrives takes one of all.
-        routes = [
-            self._ways.draw_route(link, self.turns, random)
-            for edge, link in self._ways.entries.items()
-            for random in [keyed(0, edge)]
-            for _ in range(_ROUTES)
-        ]
-        return Demand(padded(routes), np.zeros(self.vehicles), np.zeros(self.vehicles))
-
-    @cached_property
-    def _free_times(self) -> tuple[Array, Array]:
-        """Time at the limits before each link of a route, and on all of it (s): ``(R, H)`` and ``(R,)``."""
-        routes, net = self._demand.routes, self.road
-        each = np.where(routes >= 0, (net.length / net.limit)[routes], 0.0)
-        total = each.cumsum(1)
-        return total - each, total[:, -1]
-
     @property
     def features(self) -> int:
         """Length of the widest agent's observation."""
@@ -275,39 +150,16 @@ class SignalsTask:
 
     def begin(self, draw: Draw) -> World:
         """Return worlds at the beginning of an episode: empty, with everybody's departure drawn."""
-        rows, agents, journeys = len(draw.key), len(self.agents), journeys_of(self._empty)
+        shape = len(draw.key), len(self.agents)
+        return World(self.begin_state(draw), np.zeros(shape, np.int64), np.full(shape, np.inf))
 
-        def of_row(x: torch.Tensor) -> torch.Tensor:
-            return x.expand(rows, *x.shape).clone()
+    def check_actions(self, actions: Array, shape: tuple[int, int]) -> Array:
+        """Return the actions of worlds, ``shape`` (B, S); ValueError where they are no phases."""
+        if actions.shape != shape or actions.dtype.kind not in "iu" or (actions < 0).any():
+            raise ValueError(f"actions {shown(actions)} must be phases: whole numbers from 0 on, of shape {shape}.")
+        return actions
 
-        plain, lanes = self._empty._replace(lanes=None), self._empty.lanes
-        assert lanes is not None
-        links = mapped(of_row, lanes._replace(journeys=None))
-        ways = Journeys(journeys.routes, *map(of_row, journeys[1:]))
-        if self._read[1] is None:
-            route, due = self._arrivals(draw)
-            links = links._replace(lane=journeys.routes[:, 0][route.long()].long())
-            ways = ways._replace(route=route, due=due)
-        state = mapped(of_row, plain)._replace(lanes=links._replace(journeys=ways))
-        return World(state, np.zeros((rows, agents), np.int64), np.full((rows, agents), math.inf))
-
-    def _arrivals(self, draw: Draw) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return of each vehicle which route it takes, and at which step it is due (B, N): a Poisson process."""
-        share, gap, choice = (
-            draw.stream(f"signals.{what}").uniforms(0, n, torch.float64)
-            for what, n in (("inflow", 1), ("gap", self.vehicles), ("route", self.vehicles))
-        )
-        low, high = self.inflows
-        rate = (low + (high - low) * share) * len(self.entries) / 3600.0
-        due = (-gap.log()).cumsum(1) / (rate.clamp_min(1e-9) * self.simulator.dt)
-        return (choice * len(self._demand.routes)).int(), due.ceil().clamp_max(NEVER).int()
-
-    @cached_property
-    def _empty(self) -> State:
-        """One world in which everybody waits."""
-        return travelling(self.simulator, self._demand, self.params)
-
-    def step(self, world: World, actions: Array | None) -> tuple[World, SignalStep]:
+    def step(self, world: World, actions: Array | None) -> tuple[World, NetworkStep]:
         """Return worlds ``hold`` seconds later, and the outcome; ``actions`` (B, S) are phases.
 
         None leaves signals to their plans. A phase that an agent has not, or may not change to yet, keeps the present.
@@ -348,7 +200,7 @@ class SignalsTask:
         rows, agents = world.phase.shape
         seen = np.zeros((rows, agents, self.features), np.float32)
         most, full = int(self.counts.max()), np.maximum(self.road.length / 7.0, 1.0)
-        here = _Here(world.state, np.flatnonzero(_present(world.state).numpy()))
+        here = Here(world.state, np.flatnonzero(present_in(world.state).numpy()))
         links = np.arange(n := len(full))
         density, queue = (np.minimum(here.sums(x, links, n) / full, 1.0) for x in (here.inside, here.halting))
         seen[np.arange(rows)[:, None], np.arange(agents), world.phase] = 1.0
@@ -359,22 +211,10 @@ class SignalsTask:
             seen[:, k, most + 1 + widest : most + 1 + widest + len(lanes)] = queue[:, lanes]
         return seen
 
-    def _free_time(self, here: _Here) -> Array:
-        """Return the time that vehicles' ways so far take at the limits (s)."""
-        before, total = self._free_times
-        time = before[here.route, here.hop] + here.position / self.road.limit[here.link]
-        return np.where(here.left, total[here.route], np.where(here.inside, time, 0.0))
-
-    def _outcome(self, first: World, last: World) -> SignalStep:
+    def _outcome(self, first: World, last: World) -> NetworkStep:
         """Return the outcome of a step; a vehicle's lost time counts for the agent before which it was at first."""
-        begin, end = (int(world.state.step.reshape(-1)[0]) for world in (first, last))
-        ways, agents = journeys_of(first.state), len(self.agents)
-        # Who is due, and had not left: the rest has nothing to tell.
-        some = np.flatnonzero(((ways.due <= end) & (ways.left < 0)).numpy())
-        then, now = (_Here(world.state, some) for world in (first, last))
-        taken = self.simulator.dt * (np.where(now.left, now.leaves, end) - np.maximum(now.due, begin))
-        lost = taken - (self._free_time(now) - self._free_time(then))
-        waits = ~(now.inside | now.left)
+        then, now, taken, lost, step = self.tally(first.state, last.state)
+        agents = len(self.agents)
         before, behind = self._of_link
         delays = then.sums(lost, before, agents + 1)[:, :agents]
         if self.reward == "unit":
@@ -386,34 +226,7 @@ class SignalsTask:
             reward = -now.sums(now.halting, before, agents + 1)[:, :agents]
         else:
             reward = (now.sums(now.inside, behind, agents + 1) - now.sums(now.inside, before, agents + 1))[:, :agents]
-        whole = np.zeros_like(before)
-        lost, inside, waiting, halting = (now.sums(x, whole, 1)[:, 0] for x in (lost, now.inside, waits, now.halting))
-        return SignalStep(reward, lost, inside, waiting, halting, (journeys_of(last.state).left >= 0).sum(-1).numpy())
-
-
-class _Here:
-    """Links, routes and places of some vehicles, given by their index among those of all worlds."""
-
-    def __init__(self, state: State, some: Array) -> None:
-        (self.rows, n), journeys = state.position.shape, journeys_of(state)
-        assert state.lanes is not None
-        own = (state.lanes.lane, *(getattr(journeys, k) for k in ("route", "hop", "due", "left")), *state[:2])
-        self.link, self.route, self.hop, self.due, self.leaves, self.position, speed = (
-            x.reshape(-1).numpy()[some] for x in own
-        )
-        self.row, self.inside = some // n, _present(state).reshape(-1).numpy()[some]
-        self.left, self.halting = self.leaves >= 0, self.inside & (speed < HALTING)
-
-    def sums(self, weight: Array, group: Array, groups: int) -> Array:
-        """Return the sums of weights over the vehicles on links of one group ``(B, groups)``."""
-        cells = group[self.link] + groups * self.row
-        return np.bincount(cells, weight, self.rows * groups).reshape(self.rows, groups)
-
-
-def _present(state: State) -> torch.Tensor:
-    """Return a mask of the vehicles on the network (bool)."""
-    assert state.present is not None
-    return state.present > 0
+        return step._replace(reward=reward)
 
 
 def _amber(now: str, then: str) -> str:

@@ -11,26 +11,26 @@ from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import parallel_api_test
 
 import idm_env  # noqa: F401 (registers the environments)
+from idm_env.envs.network_faces import NetworkEnv, NetworkVectorEnv
 from idm_env.envs.pettingzoo import parallel_env
-from idm_env.envs.signal_faces import SignalsEnv, SignalsVectorEnv
 from idm_env.multilane.junctions import by_link, counts, travel_time
 from idm_env.roads.network import Network
 
 SMALL: dict[str, Any] = {"network": "grid 1x2", "inflow": 400.0, "duration": 200.0}
 
 
-def vector(count: int = 3, **keywords: Any) -> SignalsVectorEnv:
+def vector(count: int = 3, **keywords: Any) -> NetworkVectorEnv:
     """Return a vector as a user makes it."""
     return gymnasium.make_vec("DiffIDM-v0", count, task="signals", **{**SMALL, **keywords})  # type: ignore[return-value]
 
 
-def run(env: SignalsVectorEnv, choose: Any, steps: int = 30, seed: int = 1) -> list[Any]:
+def run(env: NetworkVectorEnv, choose: Any, steps: int = 30, seed: int = 1) -> list[Any]:
     """Return all that is told in some steps of a vector."""
     env.reset(seed=seed)
     return [env.step(choose(k)) for k in range(steps)]
 
 
-def drawn(env: SignalsVectorEnv, seed: int = 0) -> Any:
+def drawn(env: NetworkVectorEnv, seed: int = 0) -> Any:
     """Return a policy that draws phases."""
     random = np.random.default_rng(seed)
     return lambda k: random.integers(0, 2, (env.num_envs, len(env.task.agents)))
@@ -41,7 +41,7 @@ def test_a_row_of_a_batch_is_the_single_environment() -> None:
     actions = random.integers(0, 2, (30, 3, 2))
     rows = run(env, lambda k: actions[k])
     for i in range(3):
-        one = SignalsEnv(**SMALL)
+        one = NetworkEnv(**SMALL)
         one.reset(seed=1 + i)
         for k, (seen, reward, _, _, info) in enumerate(rows):
             own, paid, *_, told = one.step(actions[k, i])
@@ -116,9 +116,9 @@ def test_books_and_lost_time() -> None:
     for name, count in (("inside", books.inside), ("arrived", books.left), ("waiting", books.queued)):
         np.testing.assert_array_equal(told[name], count.numpy())
     assert (told["arrived"] > 0).all()
-    from idm_env.tasks.signals import _Here
+    from idm_env.tasks.network_task import Here
 
-    free = task._free_time(_Here(state, np.arange(state.position.numel()))).reshape(4, -1).sum(1)
+    free = task.free_time(Here(state, np.arange(state.position.numel()))).reshape(4, -1).sum(1)
     spent = travel_time(task.simulator, state).double().numpy().sum(1)
     lost = sum(row[-1]["lost"] for row in rows)
     np.testing.assert_allclose(lost, spent - free, rtol=1e-5)
@@ -172,7 +172,7 @@ def test_who_sees_traffic_does_better_than_chance() -> None:
     assert lost["fuller"] < 0.8 * lost["constant"]
 
 
-def _shown(env: SignalsVectorEnv, s: int, phase: int, link: int) -> str:
+def _shown(env: NetworkVectorEnv, s: int, phase: int, link: int) -> str:
     net = env.task.road
     return "".join(env.task.phases[s][phase][i] for i in net.index[(net.signal == s) & (net.start == link)])
 
@@ -209,7 +209,7 @@ def test_faces() -> None:
 )  # fmt: skip
 def test_what_cannot_be_is_told_in_one_line(keywords: dict[str, Any], message: str) -> None:
     with pytest.raises((ValueError, TypeError)) as error:
-        SignalsEnv(**{**SMALL, **keywords})
+        NetworkEnv(**{**SMALL, **keywords})
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 

@@ -1,4 +1,4 @@
-"""Faces of the task ``signals``: a vector, one environment, and PettingZoo, where every signal is an agent.
+"""Faces of tasks on networks: a vector, one environment, and PettingZoo, where every signal or vehicle is an agent.
 
 All worlds begin and end together: an episode has as many steps in each of them, and nothing ends it before.
 """
@@ -19,25 +19,32 @@ from gymnasium.vector.utils import batch_space
 from pettingzoo import ParallelEnv
 
 from idm_env.tasks import KeywordError
+from idm_env.tasks.junction import JunctionTask
+from idm_env.tasks.network_task import NetworkStep
 from idm_env.tasks.random import Draw
-from idm_env.tasks.signals import SignalsTask, SignalStep, World
+from idm_env.tasks.signals import SignalsTask
 from idm_env.validation import nearest, shown, whole
+
+KINDS: dict[str, type[SignalsTask] | type[JunctionTask]] = {x.name: x for x in (SignalsTask, JunctionTask)}
+"""Tasks on networks by name."""
 
 
 class _Worlds:
-    """Some worlds of the task, their seeds and the numbers of their episodes."""
+    """Some worlds of a task, their seeds and the numbers of their episodes."""
 
     def __init__(self, count: int, choices: dict[str, Any]) -> None:
-        names = [x.name for x in fields(SignalsTask)]
+        kind = KINDS[choices.pop("task", SignalsTask.name)]
+        names = [x.name for x in fields(kind)]
         for name in choices:
             if name not in names:
                 like = nearest(str(name), names)
-                raise KeywordError(f"task 'signals' got an unexpected keyword argument {shown(name)}.{like}")
+                raise KeywordError(f"task '{kind.name}' got an unexpected keyword argument {shown(name)}.{like}")
         if (limit := choices.pop("max_episode_steps", None)) is not None:
-            choices["duration"] = whole("max_episode_steps", limit, 1) * choices.get("hold", SignalsTask.hold)
-        self.task, self.count = SignalsTask(**choices), count
+            choices["duration"] = whole("max_episode_steps", limit, 1) * choices.get("hold", kind.hold)
+        self.task: Any = kind(**choices)
+        self.count = count
         self.seeds, self.episodes = np.zeros(count, np.int64), np.full(count, -1)
-        self.world: World | None = None
+        self.world: Any = None
         self.done = 0
 
     def seed(self, seeds: Sequence[int]) -> None:
@@ -52,31 +59,35 @@ class _Worlds:
         self.world = self.task.begin(draw)
         return self.task.observe(self.world)
 
-    def step(self, actions: Any) -> tuple[np.ndarray, SignalStep, bool]:
+    def step(self, actions: Any) -> tuple[np.ndarray, NetworkStep, bool]:
         """Do a step; return observations ``[B, S, F]``, the outcome, and whether the episodes are over.
 
-        RuntimeError before ``begin``; ValueError for actions (B, S) that are no phases.
+        RuntimeError before ``begin``; ValueError for actions (B, S) that cannot be.
         """
         if self.world is None:
             raise RuntimeError("step was called before reset. Call reset() first.")
         if self.done >= self.task.horizon:
             raise RuntimeError("the episodes are over. Call reset() first.")
         if actions is not None:
-            shape = (self.count, len(self.task.agents))
-            actions = np.asarray(actions)
-            if actions.shape != shape or actions.dtype.kind not in "iu" or (actions < 0).any():
-                raise ValueError(f"actions {shown(actions)} must be phases: whole numbers from 0 on, of shape {shape}.")
+            actions = self.task.check_actions(np.asarray(actions), (self.count, len(self.task.names)))
         self.world, outcome = self.task.step(self.world, actions)
         self.done += 1
         return self.task.observe(self.world), outcome, self.done == self.task.horizon
 
 
-def _info(outcome: SignalStep) -> dict[str, np.ndarray]:
+def _actions(task: Any, counts: Any = None) -> gymnasium.Space[Any]:
+    """Return the space of all agents' actions, or of one agent's with so many (``counts``)."""
+    if task.counts is None:
+        return Box(-1.0, 1.0, (len(task.names) if counts is None else 1,), np.float32)
+    return MultiDiscrete(task.counts) if counts is None else Discrete(int(counts))
+
+
+def _info(outcome: NetworkStep) -> dict[str, np.ndarray]:
     """Return an outcome's figures for infos, of each world ``[B]``."""
     return {name: np.asarray(x) for name, x in outcome._asdict().items() if name != "reward"}
 
 
-class SignalsVectorEnv(VectorEnv):
+class NetworkVectorEnv(VectorEnv):
     """``gym.make_vec("DiffIDM-v0", num_envs=64, task="signals", network="grid 5x5")``; keywords: ``SignalsTask``.
 
     A world's agents are one joint agent: observations one after the other, a phase for each, the mean of rewards. With
@@ -94,13 +105,13 @@ class SignalsVectorEnv(VectorEnv):
 
     def __init__(self, num_envs: int = 1, shared: bool = False, **choices: Any) -> None:
         self.worlds = _Worlds(whole("num_envs", num_envs, 1), choices)
-        self.task, agents = self.worlds.task, len(self.worlds.task.agents)
+        self.task, agents = self.worlds.task, len(self.worlds.task.names)
         self._shared, self._each = shared, agents if shared else 1
         self.num_envs = num_envs * self._each
         self._wide = self.task.features * (1 if shared else agents)
         self.single_observation_space = Box(0.0, 1.0, (self._wide,), np.float32)
-        most = int(self.task.counts.max())
-        self.single_action_space = Discrete(most) if shared else MultiDiscrete(self.task.counts)
+        most = 1 if self.task.counts is None else self.task.counts.max()
+        self.single_action_space = _actions(self.task, most if shared else None)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
@@ -134,16 +145,16 @@ class SignalsVectorEnv(VectorEnv):
         return rows, reward, np.zeros(self.num_envs, bool), ends, info
 
 
-class SignalsEnv(gymnasium.Env):
-    """One world: ``gym.make("DiffIDM-v0", task="signals")``; as a row of ``SignalsVectorEnv``."""
+class NetworkEnv(gymnasium.Env):
+    """One world: ``gym.make("DiffIDM-v0", task="signals")``; as a row of ``NetworkVectorEnv``."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
 
     def __init__(self, **choices: Any) -> None:
         self.worlds = _Worlds(1, choices)
-        self.task, agents = self.worlds.task, len(self.worlds.task.agents)
+        self.task, agents = self.worlds.task, len(self.worlds.task.names)
         self.observation_space = Box(0.0, 1.0, (agents * self.task.features,), np.float32)
-        self.action_space = MultiDiscrete(self.task.counts)
+        self.action_space = _actions(self.task)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin the first episode of ``seed`` if that is given, else the next one; return observations ``[S F]``."""
@@ -159,7 +170,7 @@ class SignalsEnv(gymnasium.Env):
         return seen.reshape(-1), float(outcome.reward.mean(1)[0]), False, over, info
 
 
-class signals_parallel_env(ParallelEnv[str, np.ndarray, Any]):  # noqa: N801  (as PettingZoo names environments)
+class network_parallel_env(ParallelEnv[str, np.ndarray, Any]):  # noqa: N801  (as PettingZoo names environments)
     """PettingZoo: every signal is an agent, by its name; ``parallel_env(task="signals")``."""
 
     metadata: dict[str, Any] = {"name": "diffidm_signals_v0", "is_parallelizable": True, "render_modes": []}  # noqa: RUF012
@@ -173,7 +184,8 @@ class signals_parallel_env(ParallelEnv[str, np.ndarray, Any]):  # noqa: N801  (a
         self.agents: list[str] = []
         wide = self.task.features
         self.observation_spaces = {a: Box(0.0, 1.0, (wide,), np.float32) for a in self.possible_agents}
-        self.action_spaces = {a: Discrete(int(n)) for a, n in zip(self.possible_agents, self.task.counts, strict=True)}
+        counts = [1] * len(self.possible_agents) if self.task.counts is None else self.task.counts
+        self.action_spaces = {a: _actions(self.task, n) for a, n in zip(self.possible_agents, counts, strict=True)}
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
         """Return the space of an agent's observations: the same object at every call."""
@@ -204,7 +216,7 @@ class signals_parallel_env(ParallelEnv[str, np.ndarray, Any]):  # noqa: N801  (a
             for agent in self.agents:
                 if agent not in actions:
                     raise ValueError(f"there is no action for agent '{agent}'. Give one for each of env.agents.")
-        chosen = None if actions is None else np.array([[int(actions[a]) for a in self.agents]])
+        chosen = None if actions is None else np.array([[np.asarray(actions[a]).item() for a in self.agents]])
         seen, outcome, over = self.worlds.step(chosen)
         figures = {name: x[0].item() for name, x in _info(outcome).items()}
         infos = {agent: dict(figures) for agent in self.agents}
