@@ -163,8 +163,7 @@ def _on_the_best(before: Found, laws: list[bases.Law], searched: Searched) -> Fo
     room = search.base.catalogue
     effects = tuple((best.model.catalogue.by_name | room.by_name).values())
     catalogue = replace(room, effects=effects, base=best.law, personal=own.personal, without=own.without)
-    model = Hypothesis(best.model.terms, catalogue)
-    beyond, more = searched(model, best.errors)
+    beyond, more = searched(Hypothesis(best.model.terms, catalogue), best.errors)
     other, its_last = judgement_of(beyond, more)
     if other.added and other.after is not None and improves(compare(now.of_all, other.after, evaluation.seed)):
         return beyond, more, replace(other, on=best, beneath=judgement), its_last

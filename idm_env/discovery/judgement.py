@@ -235,14 +235,16 @@ class Evaluation:
 
 def judgement_of(evaluation: Evaluation, decided: Decided) -> tuple[Judgement, Solution]:
     """Evaluate the selected model on the test set; return the judgement and the drivers' parameters fitted with it."""
-    null, rounds, last = decided.null, decided.rounds, evaluation.of_null[0]
+    null, rounds = decided.null, decided.rounds
     confirmed, refusal = _confirmed(evaluation, decided)
     # Where nothing was added, what came nearest is compared with the null and says what it would have done.
     nearest = rounds[0].partial if evaluation.test is not None else None
     compared = confirmed[-1] if confirmed else None if nearest is None else rounds[0].scored[nearest].solution
-    before = after = evaluation.of_null[1]
-    if compared is not None:
-        last, after = evaluation.judged(compared)
+    if evaluation.known is not None and not confirmed and decided.joined is None:
+        # Beyond a law that was judged before, only what is added is judged: what came nearest is told by name.
+        return Judgement(null, compared, False, refusal, evaluation.known, None, evaluation.seed), null
+    last, before = evaluation.of_null
+    last, after = (last, before) if compared is None else evaluation.judged(compared)
     judgement = Judgement(null, compared, bool(confirmed), refusal, before, after, evaluation.seed)
     if judgement.added and judgement.errors and not judgement.improves:
         judgement = replace(judgement, added=False, refusal=Refusal(Reason.HELD_OUT))

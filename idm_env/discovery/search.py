@@ -60,9 +60,8 @@ class Search:
         """What a test counts."""
         return units(self.problem.rows.records)
 
-    def null(self, model: Hypothesis, theta: np.ndarray, values: np.ndarray | None = None) -> Solution:
+    def null(self, model: Hypothesis, theta: np.ndarray, values: np.ndarray) -> Solution:
         """Fit a null and its noise in turn until both stand, from log θ [G, P] and φ [Q]; updates ``problem``."""
-        values = starting_values(model) if values is None else values
         solution = solve(self.problem, model, theta, values)
         for _ in range(3):
             self.problem = self._renoised(solution)

@@ -197,10 +197,8 @@ def linearise(
     step = np.append(np.full(own, STEP), differences(model.parameters, values))
     many = np.repeat(theta[None], 1 + own + count, axis=0)
     shared = np.repeat(values[None], 1 + own + count, axis=0)
-    for i in range(own):
-        many[1 + i, :, i] += STEP
-    for i in range(count):
-        shared[1 + own + i, i] += step[own + i]
+    many[1 + np.arange(own), :, np.arange(own)] += STEP
+    shared[1 + own + np.arange(count), np.arange(count)] += step[own:]
     first = int(base is not None)
     residual = problem.residual(problem.errors(many[first:], model, shared[first:]))
     here, moved = (residual[0], residual[1:]) if base is None else (base, residual)
@@ -345,11 +343,9 @@ def solve(
 def _mark(problem: Problem, model: Hypothesis, *begin: object) -> str:
     """Return a digest of a problem, a model and where and how it is solved."""
     rows, noise, prior = problem.rows, problem.noise, problem.known
-    parts = [rows.records.mark, *(getattr(rows, f.name) for f in fields(rows)[1:])]
-    parts += [getattr(prior, f.name) for f in fields(prior)]
-    parts += [] if noise is None else [getattr(noise, f.name) for f in fields(noise)]
+    parts = [getattr(x, f.name) for x in (rows, prior, noise) if x for f in fields(x) if f.name != "records"]
     fixed = np.zeros(0) if model.fixed_phi is None else model.fixed_phi
-    return fingerprint(*parts, problem.sigma, model.terms, model.catalogue, fixed, *begin)
+    return fingerprint(rows.records.mark, *parts, problem.sigma, model.terms, model.catalogue, fixed, *begin)
 
 
 def finish(

@@ -76,10 +76,8 @@ def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple
             step.winner, step.refusal = None, Refusal(Reason.SMALL_SIZE, least)
             break
         solution, fit = grown, after
-    if solution is None:
-        return None, steps
-    solution = _backward(start, solution, base)
-    if len(solution.model.terms) == base:
+    solution = solution and _backward(start, solution, base)
+    if solution is None or len(solution.model.terms) == base:
         return None, steps
     return Joined(solution, interval_of(solution, start.problem), closed_loop.gains(start, solution)), steps
 

@@ -35,7 +35,7 @@ def fitted_to(made: Trajectories) -> tuple[Problem, Solution]:
     rows = windows(records)
     problem = Problem(rows, first_noise(rows), first_prior())
     searching = Search(problem, ("drag",), False, lambda *_: None)
-    null = searching.null(Hypothesis(), np.tile(problem.prior.centre, (problem.groups, 1)))
+    null = searching.null(Hypothesis(), np.tile(problem.prior.centre, (problem.groups, 1)), np.zeros(0))
     return judge.windowed(records, searching.problem, null)
 
 

@@ -33,7 +33,7 @@ def begun(records: Records, *names: str) -> tuple[Search, Solution]:
     rows = windows(records)
     problem = Problem(rows, first_noise(rows), first_prior())
     searching = Search(problem, names, False, lambda *_: None)
-    return searching, searching.null(Hypothesis(), np.tile(problem.prior.centre, (problem.groups, 1)))
+    return searching, searching.null(Hypothesis(), np.tile(problem.prior.centre, (problem.groups, 1)), np.zeros(0))
 
 
 def made(seed: int, **choices: object) -> Records:
