@@ -83,7 +83,9 @@ class _Traffic:
 
     def __init__(self, network: Network, demand: Demand) -> None:
         self.network, self.demand = network, demand
-        self.simulator = Simulator(network, (IDM(), StopLine(), LinkLimit(), Brakes()))
+        # At amber SUMO's drivers stop where their own decel is enough; a network has one such number.
+        decel = min(demand.kinds[k]["idm.comfort_decel"] for k in np.unique(demand.kind))
+        self.simulator = Simulator(network, (IDM(), StopLine(most_decel=min(decel, 9.0)), LinkLimit(), Brakes()))
         self.params = junctions.of_kinds(self.simulator.defaults(), demand)
         self.state = junctions.travelling(self.simulator, demand, self.params)
         self.sums = torch.zeros(3, len(network.names), dtype=torch.float64)  # of vehicles, halting, speeds
@@ -131,13 +133,9 @@ class _Traffic:
         """Return tables of links, of trips, and of counts over time; times in s, speeds in m/s."""
         network, demand = self.network, self.demand
         vehicles, halting, speed = self.sums.numpy()
-        links: dict[str, Any] = {
-            "link": network.names,
-            "edge": network.edge,
-            "length_m": network.length,
-            "limit_mps": network.limit,
-        }
-        links |= {"mean_vehicles": vehicles / self.samples, "mean_halting": halting / self.samples}
+        links: dict[str, Any] = {"link": network.names, "edge": network.edge, "length_m": network.length}
+        links |= {"limit_mps": network.limit, "mean_vehicles": vehicles / self.samples}
+        links["mean_halting"] = halting / self.samples
         links["mean_speed_mps"] = [s / n if n else None for s, n in zip(speed.tolist(), vehicles.tolist(), strict=True)]
         ways, dt = junctions.journeys_of(self.state), self.simulator.dt
         used = [row[row >= 0] for row in demand.routes]

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -27,15 +28,19 @@ PARAMETERS = {"accel": "max_accel", "decel": "comfort_decel", "tau": "time_gap",
 PARAMETERS |= {"maxSpeed": "desired_speed"}
 """SUMO's attribute → IDM's parameter: m/s², m/s², s, m, m/s."""
 MOST_VEHICLES = 5_000_000
+Spread = tuple[float, float, float, float]
+"""Mean, deviation and bounds of what share of limits vehicles drive."""
 CAR = (5.0, 2.6, 4.5, 55.56)
 CLASSES = dict.fromkeys(("private", "vip", "hov", "evehicle", "custom1", "custom2", "authority", "army", "taxi"), CAR)
 CLASSES |= {"passenger": CAR, "emergency": (6.5, *CAR[1:]), "delivery": (6.5, *CAR[1:])}
 CLASSES |= {"truck": (7.1, 1.3, 4.0, 36.11), "trailer": (16.5, 1.1, 4.0, 36.11), "bus": (12.0, 1.2, 4.0, 27.78)}
 CLASSES |= {"coach": (14.0, 2.0, 4.0, 27.78), "motorcycle": (2.2, 6.0, 10.0, 55.56), "moped": (2.1, 1.1, 7.0, 16.67)}
 """Length, accel, decel and maxSpeed of SUMO 1.28 where a vType gives none; other classes are no cars."""
-READ = {
-    "vType": {"id", "vClass", "carFollowModel", "length", "probability", "color", "guiShape", "speedDev", *PARAMETERS}
-}
+SPREADS = dict.fromkeys(("taxi", "delivery", "truck", "trailer", "coach"), 0.05)
+SPREADS |= dict.fromkeys(("authority", "army", "emergency", "bus"), 0.0)
+"""SUMO's speedDev of classes where it is not 0.1."""
+READ = {"vType": {"id", "vClass", "carFollowModel", "length", "probability", "color", "guiShape", *PARAMETERS}}
+READ["vType"] |= {"speedFactor", "speedDev"}
 READ["vehicle"] = {"id", "type", "depart", "departSpeed", "route", "color"}
 READ["trip"] = READ["vehicle"] | {"from", "to", "via"}
 READ["flow"] = READ["trip"] | {"begin", "end", "number", "vehsPerHour", "perHour", "period", "probability"}
@@ -64,6 +69,7 @@ class _Reader:
         self.known: dict[str, dict[str, list[tuple[float, Any]]]] = {"vType": {}, "route": {}}
         self.numbers: dict[Route, int] = {}
         self.rows: list[tuple[int, float, float, float, int]] = []
+        self.drivers: dict[tuple[int, float], int] = {}
         self.ids: set[str] = set()
 
     def add(self, element: Element) -> None:
@@ -110,24 +116,21 @@ class _Reader:
             raise ValueError(f"{owner} has a route without edges. Give it some.")
         return self.ways.route_along(edges * int(number(element, "repeat", 1.0, 1.0)), owner)
 
-    def _type_of(self, element: Element, owner: str) -> tuple[int, float] | None:
-        """Return the row of ``kinds`` and the length (m) of a type, None of one that is no car's."""
+    def _type_of(self, element: Element, owner: str) -> tuple[int, float, Spread] | None:
+        """Return the row of ``kinds``, the length (m) and shares of limits of a type, None of one that is no car's."""
         self._count_unread(element)
         vehicle_class, law = element.get("vClass", "passenger"), element.get("carFollowModel", "Krauss")
         self.skipped[f"vTypes of {law} driven by IDM"] += law != "IDM"
-        self.skipped["vTypes with a spread of speed factors, driven without"] += number(element, "speedDev", 0.1) != 0.0
         if vehicle_class not in CLASSES:
             return None
         length, *defaults = CLASSES[vehicle_class]
         standard = dict(zip(("accel", "decel", "maxSpeed", "tau", "minGap"), (*defaults, 1.0, 2.5), strict=True))
         kind = {f"idm.{PARAMETERS[key]}": number(element, key, standard[key], 0.0, above=True) for key in PARAMETERS}
         self.kinds += [kind] if kind not in self.kinds else []
-        return self.kinds.index(kind), number(element, "length", length, 0.1)
+        return self.kinds.index(kind), number(element, "length", length, 0.1), _spread(element, vehicle_class)
 
     def _count_unread(self, element: Element) -> None:
-        for key, _ in element.attrib.items() - {("speedFactor", "1"), ("departPos", "0"), ("departPos", "base")}:
-            if key in READ[element.tag]:
-                continue
+        for key in {*dict(element.attrib.items() - {("departPos", "0"), ("departPos", "base")})} - READ[element.tag]:
             self.skipped[f"attribute {key} of {element.tag}"] += 1
 
     # -- vehicles ----------------------------------------------------------------------------------------------------
@@ -142,16 +145,23 @@ class _Reader:
         if key == "DEFAULT_VEHTYPE" and key not in self.known["vType"]:
             self._choices(Element("vType", id=key), "vType")
         types, routes = self._named("vType", key, element), self._routes_of(element)
-        random = keyed(self.seed, own)
+        random, shares = keyed(self.seed, own), keyed(self.seed, f"{own} speedFactor")
         for depart in self._departures(element, random) if routes else ():
             one, route = _choose(types, random), _choose(routes, random)
             if one is None:
                 self.skipped[f"vehicles of type {key}, which is no car's"] += 1
                 continue
             speed = self._entry_speed(element, self.kinds[one[0]]["idm.desired_speed"], self.limit[route[0]], random)
-            self.rows.append((self.numbers.setdefault(route, len(self.numbers)), depart, speed, one[1], one[0]))
+            kind = self._driver(one[0], round(_draw_share(one[2], shares), 3))
+            self.rows.append((self.numbers.setdefault(route, len(self.numbers)), depart, speed, one[1], kind))
             if len(self.rows) > MOST_VEHICLES:
                 raise ValueError(f"{name(element)} brings more than {MOST_VEHICLES} vehicles. Give it fewer.")
+
+    def _driver(self, kind: int, factor: float) -> int:
+        """Return the row of ``kinds`` of those who are of a kind and drive a share of limits."""
+        row = self.drivers.setdefault((kind, factor), len(self.kinds)) if factor != 1.0 else kind
+        self.kinds += [self.kinds[kind] | {"link_limit.factor": factor}] if row == len(self.kinds) else []
+        return row
 
     def _routes_of(self, element: Element) -> list[tuple[float, Route]]:
         """Return the routes of a vehicle, trip or flow with their weights; none between districts or junctions."""
@@ -215,6 +225,30 @@ class _Reader:
         if not columns:
             raise ValueError("the files of demand have no vehicle. Give vehicles, trips or flows.")
         return columns | {"routes": padded(list(self.numbers)), "kinds": tuple(self.kinds), "skipped": +self.skipped}
+
+
+def _spread(element: Element, vehicle_class: str) -> Spread:
+    """Return a type's speedFactor, a number or ``normc(mean, deviation, low, high)``; speedDev goes first."""
+    word = element.get("speedFactor", "1")
+    parts = re.sub(r"^normc?\((.*)\)$", r"\1", word).split(",")
+    try:
+        values = [float(x) for x in parts] + [SPREADS.get(vehicle_class, 0.1), 0.2, 2.0][len(parts) - 1 :]
+        mean, deviation, low, high = values
+    except ValueError:
+        mean = deviation = low = high = math.nan
+    if not 0.05 <= low <= mean <= high <= 10.0:
+        rule = "a number from 0.2 to 2, or normc(mean,deviation,low,high)"
+        raise ValueError(f"{name(element)}: speedFactor = {validation.shown(word)} must be {rule}.")
+    return mean, number(element, "speedDev", max(deviation, 0.0), 0.0), low, high
+
+
+def _draw_share(spread: Spread, random: np.random.Generator) -> float:
+    """Return one of normally distributed shares, of which those beyond the bounds are drawn again."""
+    mean, deviation, low, high = spread
+    if deviation < 1e-6 * mean:
+        return mean
+    law = NormalDist(mean, deviation)
+    return law.inv_cdf(random.uniform(law.cdf(low), law.cdf(high)))
 
 
 def _choose(pairs: list[tuple[float, Any]], random: np.random.Generator) -> Any:

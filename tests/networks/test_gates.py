@@ -110,6 +110,18 @@ def test_two_of_each_stream_pass_in_five_seconds_as_in_sumo() -> None:
     assert (passed[2] - passed[1]).tolist() == [8] * 4
 
 
+def test_who_drives_more_than_a_limit_does_so_on_every_link() -> None:
+    """Before a link of the same limit nobody brakes."""
+    network = Network.grid(1, 3, control="none", block=150.0)
+    simulator, params = simulated(network, **SUMO)
+    params["link_limit"]["factor"] = torch.tensor([1.2], dtype=torch.float64)
+    route = Ways(network).route_along(["left0A0", "A0B0", "B0C0", "C0right0"], "")
+    state = travelling(simulator, Demand(padded([route]), [0], [0.0]), params, dtype=torch.float64)
+    _, trajectory = simulator.rollout(state, {}, params, 350)
+    assert trajectory is not None
+    assert trajectory.speed[200:, 0].min() > 1.19 * 13.89
+
+
 def test_one_turns_left_after_each_green() -> None:
     """Oncoming traffic leaves no gap. SUMO lets 1.0 a cycle clear the junction when it has ended."""
     network = Network.crossing(arm=300.0)

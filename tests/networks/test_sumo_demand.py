@@ -28,14 +28,13 @@ def edges(demand: Demand, vehicle: int, network: Network = GRID) -> list[str]:
     return [network.edge[k] for k in links if k >= 0 and not network.inner[k]]
 
 
-SPREAD = "vTypes with a spread of speed factors, driven without"
 WAY = "left0A0 A0B0 B0right0"
 
 
 def test_vehicles_trips_and_flows(tmp_path: Path) -> None:
     """In order of departure; a trip takes the quickest way, a flow's vehicles are evenly in time."""
     demand = read(
-        '<vType id="t" carFollowModel="IDM" vClass="truck" accel="1.1" tau="1.5"/>'
+        '<vType id="t" carFollowModel="IDM" vClass="truck" accel="1.1" tau="1.5" speedDev="0"/>'
         f'<route id="r" edges="{WAY}"/>'
         '<vehicle id="a" type="t" route="r" depart="0:01:40" departSpeed="max"/>'
         f'<vehicle id="b" depart="7.5" departSpeed="4"><route edges="{WAY}"/></vehicle>'
@@ -51,7 +50,7 @@ def test_vehicles_trips_and_flows(tmp_path: Path) -> None:
     ]  # fmt: skip
     truck = {"max_accel": 1.1, "comfort_decel": 4.0, "time_gap": 1.5, "min_gap": 2.5, "desired_speed": 36.11}
     assert demand.kinds[demand.kind[5]] == {f"idm.{key}": value for key, value in truck.items()}
-    assert demand.skipped == {"vTypes of Krauss driven by IDM": 1, SPREAD: 2}  # one for those without a type
+    assert demand.skipped == {"vTypes of Krauss driven by IDM": 1}  # one for those without a type
 
 
 @pytest.mark.parametrize(
@@ -85,6 +84,35 @@ def test_types_and_routes_of_distributions_are_drawn_by_their_shares(tmp_path: P
     assert demand.skipped == {}
 
 
+@pytest.mark.parametrize(
+    ("words", "mean", "deviation"),
+    [
+        ('speedFactor="normc(1.1,0.2,0.4,1.8)"', 1.1, 0.2),
+        ('speedFactor="0.9"', 0.9, 0.1),
+        ('speedFactor="norm(1,0.3)" speedDev="0.05"', 1.0, 0.05),
+        ('vClass="truck"', 1.0, 0.05),
+        ('speedFactor="1.2" speedDev="0"', 1.2, 0.0),
+        ('speedFactor="normc(1,5,0.9,1.1)"', 1.0, 0.2 / 12**0.5),
+    ],
+)
+def test_limits_are_driven_by_shares_of_the_given_spread(
+    words: str, mean: float, deviation: float, tmp_path: Path
+) -> None:
+    """Within four standard errors, drawn alike by the same seed; departures and routes are those without a spread."""
+    flow = '<flow id="f" type="t" from="left0A0" to="B0right0" begin="0" end="9000" period="exp(0.4)"/>'
+    demand, plain, other = (
+        read(f'<vType id="t" carFollowModel="IDM" {more}/>{flow}', tmp_path) for more in (words, 'speedDev="0"', words)
+    )
+    factor, again = (
+        np.array([d.kinds[k].get("link_limit.factor", 1.0) for k in d.kind.tolist()]) for d in (demand, other)
+    )
+    np.testing.assert_array_equal(factor, again)
+    np.testing.assert_array_equal(demand.depart, plain.depart)
+    assert abs(factor.mean() - mean) <= 4.0 * deviation / len(factor) ** 0.5 + 1e-9
+    assert abs(factor.std() - deviation) <= 0.06 * deviation + 1e-9
+    assert demand.skipped == {}
+
+
 def test_what_is_not_traffic_of_cars_is_counted(tmp_path: Path) -> None:
     demand = read(
         '<vType id="t" carFollowModel="IDM" sigma="0" speedDev="0.1"/><vType id="walk" vClass="pedestrian"/>'
@@ -97,7 +125,7 @@ def test_what_is_not_traffic_of_cars_is_counted(tmp_path: Path) -> None:
     )  # fmt: skip
     assert len(demand.route) == 2
     assert demand.skipped == {
-        "attribute sigma of vType": 1, SPREAD: 3, "vTypes of Krauss driven by IDM": 2,
+        "attribute sigma of vType": 1, "vTypes of Krauss driven by IDM": 2,
         "elements <person>": 1, "elements <busStop>": 1, "trips between districts or junctions": 1,
         "vehicles of type walk, which is no car's": 1, "attribute departLane of vehicle": 1,
         "elements <stop> of vehicle": 2,
@@ -121,6 +149,9 @@ def test_what_is_not_traffic_of_cars_is_counted(tmp_path: Path) -> None:
         ('<vehicle id="v" route="r" depart="0"/>', "<vehicle id=\"v\">: route 'r' is unknown"),
         ('<vehicle id="v" depart="0"/>', '<vehicle id="v"> has no route'),
         ('<vType id="t" accel="0"/>', "<vType id=\"t\">: accel = '0' must be a number above 0"),
+        ('<vType id="t" speedFactor="norm(1)x"/>', "speedFactor = 'norm(1)x' must be a number from 0.2"),
+        ('<vType id="t" speedFactor="normc(3,0.1,0.2,2)"/>', "speedFactor = 'normc(3,0.1,0.2,2)' must be"),
+        ('<vType id="t" speedDev="-1"/>', "<vType id=\"t\">: speedDev = '-1' must be a number of at least 0"),
         ('<vType id="t" length="long"/>', "<vType id=\"t\">: length = 'long' must be a number"),
         ('<vType/>', "<vType> has no id"),
         ('<flow id="f" from="left0A0" to="A0B0"/>', '<flow id="f"> has neither a number nor a rate'),

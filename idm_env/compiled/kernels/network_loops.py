@@ -328,7 +328,8 @@ def look_ahead(i, sizes, car, tag, road, site, move, routes, rules, driver):
     """
     v, k, m, room = car[W * i + SPEED], tag[W * i + LINK], tag[W * i + GATE], car[W * i + LINE] - car[W * i + POSITION]
     tag[W * i + WAITS] = NONE
-    car[W * i + LIMIT], car[W * i + STOP] = road[K * k + FAST], road[K * k + LONG] if car[W * i + LATER] < v else OPEN
+    car[W * i + LIMIT], slower = road[K * k + FAST], car[W * i + LATER] < min(v, road[K * k + FAST])
+    car[W * i + STOP] = road[K * k + LONG] if slower else OPEN
     if m < 0:
         return
     j = tag[W * i + LEADER]
