@@ -51,7 +51,7 @@ Policy = Callable[[NetworkVectorEnv, np.ndarray], Any]
 
 def made(count: int, **keywords: Any) -> NetworkVectorEnv:
     """Return that many worlds."""
-    return gymnasium.make_vec("DiffIDM-v0", count, task="signals", **keywords)  # type: ignore[return-value]
+    return gymnasium.make_vec("DiffIDM-v0", count, **{"task": "signals", **keywords})  # type: ignore[return-value]
 
 
 def delays(env: NetworkVectorEnv, policy: Policy, seed: int) -> np.ndarray:
@@ -194,8 +194,8 @@ def in_sumo(episodes: int, policy: Policy, keywords: dict[str, Any]) -> np.ndarr
         return np.concatenate([delays(env, policy, FRESH + i) for i in range(episodes)])
 
 
-def trained(seed: int, steps: int, **keywords: Any) -> tuple[Policy, float]:
-    """Return PPO's last policy, one for all signals, and the CPU time of its training (s)."""
+def trained(seed: int, steps: int, more: dict[str, Any] = PPO, **keywords: Any) -> tuple[Policy, float]:
+    """Return PPO's last policy, one for all agents, and the CPU time of its training (s)."""
     import stable_baselines3
     from stable_baselines3.common.vec_env import VecNormalize
 
@@ -203,9 +203,9 @@ def trained(seed: int, steps: int, **keywords: Any) -> tuple[Policy, float]:
 
     torch.set_num_threads(1)
     start = time.process_time()
-    worlds = made(8, shared=True, reward="delay", **keywords)
-    scaled = VecNormalize(SB3VecEnv(worlds), gamma=PPO["gamma"])
-    settings = PPO | {"seed": seed, "device": "cpu", "learning_rate": lambda left: 1e-3 * left}
+    worlds = made(8, shared=True, **{"reward": "delay", **keywords})
+    scaled = VecNormalize(SB3VecEnv(worlds), gamma=more["gamma"])
+    settings = more | {"seed": seed, "device": "cpu", "learning_rate": lambda left: 1e-3 * left}
     agent = stable_baselines3.PPO("MlpPolicy", scaled, **settings)
     agent.learn(steps)
     scaled.training = False

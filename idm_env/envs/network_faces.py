@@ -88,13 +88,13 @@ def _info(outcome: NetworkStep) -> dict[str, np.ndarray]:
 
 
 class NetworkVectorEnv(VectorEnv):
-    """``gym.make_vec("DiffIDM-v0", num_envs=64, task="signals", network="grid 5x5")``; keywords: ``SignalsTask``.
+    """``gym.make_vec("DiffIDM-v0", num_envs=64, task="signals", network="grid 5x5")``; keywords: those of the task.
 
-    A world's agents are one joint agent: observations one after the other, a phase for each, the mean of rewards. With
-    ``shared`` every agent of every world is an environment of its own, as one policy for all needs: Discrete actions,
-    ``num_envs`` times agents rows. Worlds reset within the step that ends them (``"SameStep"``). ``step(None)`` leaves
-    signals to their plans. Infos tell, of each world, vehicles ``inside``, ``waiting``, ``halting`` and ``arrived``,
-    and the time ``lost`` in the step (s).
+    A world's agents are one joint agent: observations one after the other, an action for each, the mean of rewards.
+    With ``shared`` every agent of every world is an environment of its own, as one policy for all needs: ``num_envs``
+    times agents rows. Worlds reset within the step that ends them (``"SameStep"``). ``step(None)`` leaves signals to
+    their plans, and vehicles to their drivers. Infos tell, of each world, vehicles ``inside``, ``waiting``,
+    ``halting`` and ``arrived``, and the time ``lost`` in the step (s).
 
     Raises:
         TypeError: For a keyword that does not exist, with a suggestion.
@@ -131,7 +131,7 @@ class NetworkVectorEnv(VectorEnv):
         return self._rows(self.worlds.begin()), {}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advance all worlds by ``hold`` seconds with phases ``[n]`` or ``[n, S]``; ValueError for what is no phase."""
+        """Advance all worlds by ``hold`` seconds with actions ``[n]`` or ``[n, S]``; ValueError for what is none."""
         chosen = None if actions is None else np.asarray(actions).reshape(self.worlds.count, -1)
         seen, outcome, over = self.worlds.step(chosen)
         reward = outcome.reward.reshape(-1) if self._shared else outcome.reward.mean(1)
@@ -164,16 +164,16 @@ class NetworkEnv(gymnasium.Env):
         return self.worlds.begin().reshape(-1), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Advance by ``hold`` seconds with phases ``[S]``; None leaves signals to their plans."""
+        """Advance by ``hold`` seconds with actions ``[S]``; None for no agents."""
         seen, outcome, over = self.worlds.step(None if action is None else np.asarray(action)[None])
         info = {name: x[0].item() for name, x in _info(outcome).items()}
         return seen.reshape(-1), float(outcome.reward.mean(1)[0]), False, over, info
 
 
 class network_parallel_env(ParallelEnv[str, np.ndarray, Any]):  # noqa: N801  (as PettingZoo names environments)
-    """PettingZoo: every signal is an agent, by its name; ``parallel_env(task="signals")``."""
+    """PettingZoo: every signal, by its name, or vehicle is an agent; ``parallel_env(task="signals")``."""
 
-    metadata: dict[str, Any] = {"name": "diffidm_signals_v0", "is_parallelizable": True, "render_modes": []}  # noqa: RUF012
+    metadata: dict[str, Any] = {"name": "diffidm_networks_v0", "is_parallelizable": True, "render_modes": []}  # noqa: RUF012
 
     def __init__(self, max_cycles: int | None = None, **choices: Any) -> None:
         if max_cycles is not None:
@@ -206,7 +206,7 @@ class network_parallel_env(ParallelEnv[str, np.ndarray, Any]):  # noqa: N801  (a
         return self._by_agent(self.worlds.begin()[0]), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, Any] | None) -> tuple[Any, Any, Any, Any, Any]:
-        """Advance by ``hold`` seconds with a phase of every agent; None in place of all of them: their plans.
+        """Advance by ``hold`` seconds with an action of every agent; None in place of all of them.
 
         ValueError for an agent without an action.
         """
@@ -218,14 +218,8 @@ class network_parallel_env(ParallelEnv[str, np.ndarray, Any]):  # noqa: N801  (a
                     raise ValueError(f"there is no action for agent '{agent}'. Give one for each of env.agents.")
         chosen = None if actions is None else np.array([[np.asarray(actions[a]).item() for a in self.agents]])
         seen, outcome, over = self.worlds.step(chosen)
-        figures = {name: x[0].item() for name, x in _info(outcome).items()}
-        infos = {agent: dict(figures) for agent in self.agents}
+        infos = {agent: {name: x[0].item() for name, x in _info(outcome).items()} for agent in self.agents}
         ends = dict.fromkeys(self.agents, over)
         self.agents = [] if over else self.agents
-        return (
-            self._by_agent(seen[0]),
-            self._by_agent(outcome.reward[0].tolist()),
-            dict.fromkeys(self.possible_agents, False),
-            ends,
-            infos,
-        )
+        paid, ended = self._by_agent(outcome.reward[0].tolist()), dict.fromkeys(self.possible_agents, False)
+        return self._by_agent(seen[0]), paid, ended, ends, infos

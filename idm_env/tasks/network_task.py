@@ -238,13 +238,8 @@ class NetworkTask:
         lost = taken - (self.free_time(now) - self.free_time(then))
         whole, waits = np.zeros(len(self.road.names), np.int64), ~(now.inside | now.left)
         figures = [now.sums(x, whole, 1)[:, 0] for x in (lost, now.inside, waits, now.halting)]
-        return (
-            then,
-            now,
-            taken,
-            lost,
-            NetworkStep._make([taken, *figures, (journeys_of(last).left >= 0).sum(-1).numpy()]),
-        )
+        step = NetworkStep._make([taken, *figures, (journeys_of(last).left >= 0).sum(-1).numpy()])
+        return then, now, taken, lost, step
 
 
 class Here:
