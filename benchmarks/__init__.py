@@ -87,3 +87,27 @@ def named_rows(work: Work[P, Any], parts: Mapping[str, P], out: Path, place: Wor
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+
+
+def ranked(rounds: Iterable[Any], most: int = 12) -> list[dict[str, Any]]:
+    """Return what every round of a search saw: which won, and its candidates by held-out gain, ``most`` of each kind.
+
+    Kinds are names of the catalogue, and curves, places and times without one. Gains are in log RMSE, of every unit.
+    """
+    rows = []
+    for step in rounds:
+        order = step.tested.gain.argsort()[::-1].tolist()
+        by_kind = [[i for i in order if (step.scored[i].term.effect is None) is bare][:most] for bare in (False, True)]
+        best = [
+            {
+                "label": (term := step.scored[i].term).label, "effect": term.effect, "coordinate": term.coordinate,
+                "curve": term.fades, "past": term.past, "fitted": step.scored[i].solution is not None,
+                "p": float(step.tested.p_value[i]), "gain": float(step.tested.gain[i]),
+                "gains": [round(float(g), 5) for g in step.scored[i].gains],
+            }
+            for kind in by_kind for i in kind
+        ]  # fmt: skip
+        winner = None if step.winner is None else step.scored[step.winner].term.label
+        reason = None if step.refusal is None else step.refusal.reason.name
+        rows.append({"winner": winner, "refused": reason, "free": step.in_closed_loop, "best": best})
+    return rows

@@ -21,7 +21,7 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 
-from benchmarks import command, rows_of  # noqa: E402
+from benchmarks import command, ranked, rows_of  # noqa: E402
 from idm_env.jobs.workers import IN_PROCESSES, Workers  # noqa: E402
 
 RESPONSE = {"delay", "lag"}
@@ -229,6 +229,7 @@ def measure(job: Job, on_progress: object = None) -> dict[str, Any]:
         "best": next((c["effect"] for c in report["candidates"]), ""),
         "best_gain": next((c["held_out_gain"] for c in report["candidates"]), 0.0),
         "where": [f["where"] for f in report["found"]],
+        "rounds": ranked(discovery.rounds),
     }
     if job.kind == "one" and names[:1] == [job.effect] and job.effect in TRUE:
         parameter, sign = TRUE[job.effect]

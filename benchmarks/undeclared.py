@@ -21,7 +21,7 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 
-from benchmarks import command, rows_of, table  # noqa: E402
+from benchmarks import command, ranked, rows_of, table  # noqa: E402
 from idm_env.jobs.workers import IN_PROCESSES, Workers  # noqa: E402
 
 KINDS: dict[str, tuple[str, ...]] = {
@@ -160,7 +160,8 @@ def measure(job: Job, on_progress: object = None) -> dict[str, Any]:
     from idm_env.discovery import discover
 
     trajectories, begin = generated(job), time.process_time()
-    report = discover(trajectories, seed=job.seed).report
+    discovery = discover(trajectories, seed=job.seed)
+    report = discovery.report
     spent = time.process_time() - begin  # of the tool: what noise alone leaves is worked out below
     before, after, floor = (report["error"][name] for name in ("before", "after", "floor"))
     return dataclasses.asdict(job) | {
@@ -179,6 +180,7 @@ def measure(job: Job, on_progress: object = None) -> dict[str, Any]:
         "ahead_floor": floor["horizon_rmse_m"],
         "excluded": [_holds(e) for e in report["excluded"]],
         "cpu_s": spent,
+        "rounds": ranked(discovery.rounds),
     }
 
 
