@@ -171,15 +171,16 @@ class Search:
         starts = starts or [np.append(solution.values, s) for s in term.starts]
         share, scaled = promise or self._promise(solution, term, starts)
         # Chance alone lowers the error by the number of parameters over that of the errors.
-        if share.max() < FAINT + term.size / solution.linear.residual.size:
+        promising = bool(share.max() >= FAINT + term.size / solution.linear.residual.size)
+        if not promising:
             best = solve(self.problem, model, solution.theta, scaled[share.argmax()], iterations=1)
         else:
-            promising = [starts[i] for i in np.argsort(-share)[:RACED] if share[i] >= NEAR * share.max()]
-            first = [solve(self.problem, model, solution.theta, s, iterations=5) for s in promising]
+            near = [starts[i] for i in np.argsort(-share)[:RACED] if share[i] >= NEAR * share.max()]
+            first = [solve(self.problem, model, solution.theta, s, iterations=5) for s in near]
             best = min(first, key=lambda s: s.cost)
-            if 0.5 * np.log(solution.cost / best.cost) >= worth:
+            if promising := 0.5 * np.log(solution.cost / best.cost) >= worth:
                 best = solve(self.problem, model, best.theta, best.values, iterations=8)
-        return Scored(term, best, log_gain(before, held_out(self.problem, best)))
+        return Scored(term, best, log_gain(before, held_out(self.problem, best, exact=promising)))
 
     def _promise(
         self, solution: Solution, term: Term, begin: Sequence[np.ndarray] | None = None
@@ -218,10 +219,13 @@ class Search:
         have, result = {t.label: t for t in solution.model.terms}, []
         past = any(t.past for t in have.values())  # of which there is one in a model
         screened = [(t, *_line(responses, t)) for t in curves if t.label not in have and not (past and t.past)]
-        screened.sort(key=lambda one: -one[2].mean())
-        for i, (term, start, gains) in enumerate(screened):
-            least = max(worth, NEAR * screened[0][2].mean())
-            faint = gains.mean() < least and (term.effect is None or term.what != "acceleration" or worth > WORTH)
+        # A straight line has no end where a run is far from it: a loss counts for no more than the largest gain.
+        promises = [float(np.maximum(gains, -gains.max()).mean()) for *_, gains in screened]
+        for i, number in enumerate(np.argsort(np.negative(promises), kind="stable")):
+            term, start, gains = screened[number]
+            faint = promises[number] < max(worth, NEAR * max(promises)) and (
+                term.effect is None or term.what != "acceleration" or worth > WORTH
+            )
             if faint or i >= RACED:
                 result.append(Scored(term, None, gains))
                 continue

@@ -47,7 +47,7 @@ ALONG = {
     "lead_accel": "leader's acceleration", "relative_gap": "gap relative to the desired one",
     "time_since_stop": "time since the last stop", "mean_speed_20s": "mean speed of the last 20 s",
     "mean_speed_90s": "mean speed of the last 90 s", "braking_15s": "hardest recent braking",
-    "lead_braking_15s": "leader's hardest recent braking", "own_accel": "own acceleration of the last second",
+    "lead_braking_15s": "leader's hardest recent braking", "own_accel": "driver's acceleration in the last second",
     "lead_trend": "leader's recent change of speed", "lead_change_3s": "leader's change of speed in 3 s",
     "headway_behind": "time gap of the follower", "gap_behind": "gap of the follower",
     "second_opening": "speed of the second leader over the leader's",

@@ -16,9 +16,9 @@ from idm_env.discovery import model as terms, places, search, selection
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.march import COLUMNS, PULSED
 from idm_env.discovery.model import Hypothesis
-from idm_env.discovery.noise import first_noise
+from idm_env.discovery.noise import Noise, first_noise
 from idm_env.discovery.records import Records, gather, whole, windows
-from idm_env.discovery.score import SYSTEMATIC, half_width, held_out
+from idm_env.discovery.score import SYSTEMATIC, half_width, held_out, log_gain
 from idm_env.discovery.search import Scored, Search
 from idm_env.discovery.selection import _same_class
 from idm_env.discovery.solve import Problem, Solution, _Nested, linearise, solve
@@ -86,7 +86,7 @@ def test_what_promises_nothing_costs_little_and_what_is_there_is_fitted(monkeypa
         monkeypatch.undo()
 
 
-def test_an_interval_is_as_wide_as_fits_without_a_run_differ() -> None:
+def test_an_interval_is_as_wide_as_fits_without_a_run_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     searching, null = begun(made(31, runs=8, followers=2, seconds=150.0, effect="memory", ou=0.05), "memory")
     model, problem = Hypothesis((terms.simple("memory"),)), searching.problem
     found = solve(problem, model, null.theta, np.array(model.terms[0].starts[-1]), iterations=30, tolerance=1e-8)
@@ -94,12 +94,41 @@ def test_an_interval_is_as_wide_as_fits_without_a_run_differ() -> None:
     without = [problem.of_rows(problem.rows.run != run) for run in runs]
     left = [solve(t, model, found.theta, found.values, iterations=20, tolerance=1e-7).values[0] for t in without]
     jackknife = np.std(left) * np.sqrt(len(runs) - 1)
-    quiet = replace(problem, noise=None)
-    share = half_width(found, quiet)[0] ** 2 - (1.96 * SYSTEMATIC * found.values[0]) ** 2
+    wide = half_width(found, problem)[0]
+    with monkeypatch.context() as without_noise:
+        without_noise.setattr(Noise, "wander", 0.0)
+        quiet = half_width(found, problem)[0]
+    share = quiet**2 - (1.96 * SYSTEMATIC * found.values[0]) ** 2
     assert np.sqrt(share) / student.ppf(0.975, len(runs) - 1) == pytest.approx(jackknife, rel=0.12)
     # Drivers' noise, alike in all runs, does not show in how these differ.
     assert problem.noise is not None and 0.03 < problem.noise.wander < 0.08
-    assert half_width(found, problem)[0] > half_width(found, quiet)[0]
+    assert wide > quiet
+
+
+def test_the_run_that_decides_is_held_out_by_a_solution_on_the_others() -> None:
+    """A Newton step without the only run that has the effect ended at a gain of −0.70."""
+    alike, _ = synthetic.generate(31, runs=4, followers=2, seconds=60.0)
+    other, _ = synthetic.generate(32, runs=1, followers=2, seconds=120.0, effect="speed_time_gap")
+    parts = [list(episodes(part, smooth=True, min_seconds=12.0)) for part in (alike, other)]
+    searching, null = begun(gather([*parts[0], *(replace(e, run_id="other") for e in parts[1])]), "speed_time_gap")
+    before = held_out(searching.problem, null)
+    one = solve(searching.problem, Hypothesis((terms.simple("speed_time_gap"),)), null.theta, np.zeros(1), iterations=1)
+    mine, gains = searching.problem.rows.run == 4, log_gain(before, held_out(searching.problem, one))
+    rest = solve(searching.problem.of_rows(~mine), one.model, null.theta, one.values)
+    fixed = solve(searching.problem.of_rows(mine), one.model.fixed(rest.values), null.theta, np.zeros(0))
+    exact = 0.5 * np.log(before[4] / (fixed.linear.residual**2).sum())
+    assert gains[4] == pytest.approx(exact, abs=0.02) and gains[4] > -0.05
+    assert log_gain(before, held_out(searching.problem, one, exact=False))[4] < -0.5
+
+
+def test_a_curve_is_fitted_although_its_line_misses_one_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    searching, null = begun(made(31, runs=4, followers=1, seconds=60.0), "drag")
+    gains = {"speed": np.array([0.1, 0.1, 0.1, -0.8]), "gap": np.array([0.0, 0.02, 0.0, 0.0])}
+    curves = [terms.curve("time_gap", c, 0.0, 5.0, 4) for c in gains]
+    monkeypatch.setattr(search, "_line", lambda responses, term: (np.zeros(4), gains[term.coordinate]))
+    monkeypatch.setattr(Search, "_nested", lambda self, solution, term, *rest: Scored(term, null, np.ones(4)))
+    scored = searching._curves(null, places.respond(searching.problem, null), np.ones(4), curves)
+    assert {s.term.coordinate: s.solution is not None for s in scored} == {"speed": True, "gap": False}
 
 
 def test_a_law_alone_has_a_loop_of_its_own(platoon: Records) -> None:
