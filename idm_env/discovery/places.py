@@ -62,6 +62,11 @@ class Responses:
             vector[unit] = -mine.T @ self.residual[unit_of_row == unit].reshape(-1)
         return matrix, vector
 
+    def gains(self, c: np.ndarray, matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+        """Return gains [units] in log RMSE by coefficients c [units, B]; no square falls by more than nine tenths."""
+        gained = 2 * np.einsum("ub,ub->u", c, vector) - np.einsum("ub,ubc,uc->u", c, matrix, c)
+        return -0.5 * np.log(1.0 - np.clip(gained / np.maximum(self.square, 1e-12), -9.0, 0.9))
+
 
 def respond(problem: Problem, solution: Solution) -> Responses:
     """Return the responses at a solution."""
@@ -134,15 +139,9 @@ def bins_of(values: np.ndarray, width: float, most: int = 60) -> tuple[np.ndarra
 
 
 def scan(
-    responses: Responses,
-    what: str,
-    coordinate: str,
-    width: float,
-    *,
-    open_end: bool = False,
-    shortest: int = 1,
+    responses: Responses, what: str, coordinate: str, width: float, *, open_end: bool = False, shortest: int = 1,
     longest: float = np.inf,
-) -> Found | None:
+) -> Found | None:  # fmt: skip
     """Return the interval of a coordinate in which a change of ``what`` explains most, or None without enough data.
 
     ``open_end`` takes only intervals that last to the end: steps; ``shortest`` bins, ``longest`` in its own unit.
@@ -161,16 +160,13 @@ def scan(
     if not allowed.any():
         return None
     total = _best(matrix.sum(0), vector.sum(0), allowed)
-    gains, stable = np.zeros(len(vector)), np.zeros(len(vector), bool)
+    without, stable = np.zeros_like(vector), np.zeros(len(vector), bool)
     for mine in _by_run(responses):
         i, j, amount = _best(matrix.sum(0) - matrix[mine].sum(0), vector.sum(0) - vector[mine].sum(0), allowed)
-        pick = np.zeros(count)
-        pick[i : j + 1] = 1.0
-        for unit in mine:
-            gained = 2 * amount * pick @ vector[unit] - amount**2 * pick @ matrix[unit] @ pick
-            gains[unit] = log_gain(gained, responses.square[unit])
+        without[mine, i : j + 1] = amount
         stable[mine] = abs(i - total[0]) <= 1 and abs(j - total[1]) <= 1
     i, j, amount = total
+    gains = responses.gains(without, matrix, vector)
     return Found(float(edges[i]), float(edges[j + 1]), amount, gains, stable, width)
 
 
@@ -178,11 +174,6 @@ def _by_run(responses: Responses) -> list[np.ndarray]:
     """Return the units of every run, which are left out together."""
     run = responses.units.run
     return [np.flatnonzero(run == r) for r in np.unique(run)]
-
-
-def log_gain(gained: float, square: float) -> float:
-    """Gain in log RMSE where the squared residual falls by ``gained`` (limited to nine tenths)."""
-    return float(-0.5 * np.log(1.0 - np.clip(gained / max(square, 1e-12), -9.0, 0.9)))
 
 
 def _allowed(count: int, open_end: bool, shortest: int, inner: bool) -> np.ndarray:
@@ -224,12 +215,11 @@ def linear_curve(
     """
     matrix, vector = responses.design(what, basis)
     ridge = np.eye(vector.shape[1]) / spread**2
-    gains, without = np.zeros(len(vector)), np.zeros_like(vector)
+    without = np.zeros_like(vector)
     for mine in _by_run(responses):
-        c = np.linalg.solve(matrix.sum(0) - matrix[mine].sum(0) + ridge, vector.sum(0) - vector[mine].sum(0))
-        without[mine] = c
-        for unit in mine:
-            gains[unit] = log_gain(float(2 * c @ vector[unit] - c @ matrix[unit] @ c), responses.square[unit])
+        others = matrix.sum(0) - matrix[mine].sum(0) + ridge
+        without[mine] = np.linalg.solve(others, vector.sum(0) - vector[mine].sum(0))
+    gains = responses.gains(without, matrix, vector)
     return np.linalg.solve(matrix.sum(0) + ridge, vector.sum(0)), gains, without
 
 
@@ -272,7 +262,5 @@ def best_period(responses: Responses, shortest: float = 6.0, longest: float = 15
     gains = np.zeros(matrix.shape[1])
     for mine in _by_run(responses):
         k, c = best(mine)
-        for unit in mine:
-            gained = float(2 * c @ vector[k, unit] - c @ matrix[k, unit] @ c)
-            gains[unit] = log_gain(gained, responses.square[unit])
+        gains[mine] = responses.gains(np.broadcast_to(c, vector[k].shape), matrix[k], vector[k])[mine]
     return *tries[best(np.zeros(0, int))[0]], gains

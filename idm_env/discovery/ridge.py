@@ -97,5 +97,4 @@ def weights(rows: Rows, error: np.ndarray) -> np.ndarray:
 
 def by_group(rows: Rows, values: np.ndarray) -> np.ndarray:
     """Return values [W] as the mean over the driver's windows of every window [W]."""
-    count = np.bincount(rows.group)
-    return (np.bincount(rows.group, values) / np.maximum(count, 1))[rows.group]
+    return (np.bincount(rows.group, values) / np.maximum(np.bincount(rows.group), 1))[rows.group]

@@ -34,34 +34,29 @@ def held_out(problem: Problem, solution: Solution, exact: bool = True) -> np.nda
     noise makes a θ from 90 s so uncertain that most of the power is lost: an effect that lowered the error of every run
     by 4 % was missed.)
     """
-    rows = problem.rows
-    model = solution.model
-    linear = solution.linear
+    rows, model, linear = problem.rows, solution.model, solution.linear
     change, far = left_out(problem, solution, exact)
     counted = units(rows.records)
     if _spans_runs(problem):
         # Drivers of several runs share θ, which then stays that of all runs: to first order.
         moved = linear.residual + np.einsum("rmq,rq->rm", projected(solution), change[rows.run])
         return counted.sums(rows.record, (moved**2).sum(-1))
-    own = linear.own
-    part = replace(problem, prior=solution.prior)
+    own, part = linear.own, replace(problem, prior=solution.prior)
     shifted = linear.residual + np.einsum("rmq,rq->rm", linear.by_phi, change[rows.run])
     gradient, matrix = equations(part, solution.theta, Linear(shifted, linear.jacobian[:own], own))
     step = -np.linalg.solve(matrix + 1e-9 * np.eye(own), gradient[..., None])[..., 0]
-    low, high = solution.model.catalogue.bounds.T
-    theta = np.clip(solution.theta + np.clip(step, -0.5, 0.5), low, high)
+    theta = np.clip(solution.theta + np.clip(step, -0.5, 0.5), *model.catalogue.bounds.T)
     for run in far:
         mine, fixed = rows.run == run, model.fixed(solution.values + change[run])
-        fitted = solve(part.of_rows(mine), fixed, solution.theta, np.zeros(0), iterations=6).theta
-        theta[rows.group[mine]] = fitted[rows.group[mine]]
+        group = rows.group[mine]
+        theta[group] = solve(part.of_rows(mine), fixed, solution.theta, np.zeros(0), iterations=6).theta[group]
     by_group = np.zeros((problem.groups, len(solution.values)))
     by_group[rows.group] = change[rows.run]
     values = np.repeat((solution.values + by_group)[None], 2, axis=0)
     both = np.stack([theta, solution.theta])
     residual = problem.residual(problem.errors(both, model, values))
-    better = cost_of(part, both, residual).argmin(0)[rows.group]
-    square = (residual**2).sum(-1)
-    return counted.sums(rows.record, np.where(better == 0, square[0], square[1]))
+    better, square = cost_of(part, both, residual).argmin(0)[rows.group], (residual**2).sum(-1)
+    return counted.sums(rows.record, np.where(better == 0, *square))
 
 
 def _spans_runs(problem: Problem) -> bool:
@@ -150,7 +145,10 @@ def westfall_young(gains: np.ndarray, seed: int = 0, run: np.ndarray | None = No
     as negative. With few runs all 2^R flips are taken, otherwise a sample; the smallest p-value of runs is 2^−R.
     """
     run = np.arange(gains.shape[1]) if run is None else run
-    statistic = _flipped(gains, seed, run)
+    roots = np.sign(gains) * np.sqrt(np.abs(gains))
+    flips = signs(run, rho(roots, run), seed)
+    # With signs flipped [flips, K], first as it is.
+    statistic = flips @ roots.T / np.sqrt(np.abs(gains).sum(1) + FAINT * gains.shape[1])
     p_value = (statistic.max(1)[:, None] >= statistic[0] - 1e-12).mean(0)
     mean, width = _mean_of(gains, run)
     return Tested(p_value, mean, np.stack([mean - width, mean + width], axis=1))
@@ -172,13 +170,6 @@ def rivals(gains: np.ndarray, winner: int, run: np.ndarray) -> list[int]:
     own, own_width = _mean_of(gains, run)
     near = [i for i in np.argsort(-own) if i != winner and own[i] > own_width[i] and less[i] <= width[i]]
     return [int(i) for i in near]
-
-
-def _flipped(gains: np.ndarray, seed: int, run: np.ndarray) -> np.ndarray:
-    """Return the statistic of candidates with signs flipped [flips, K], first as it is."""
-    roots = np.sign(gains) * np.sqrt(np.abs(gains))
-    flips = signs(run, rho(roots, run), seed)
-    return flips @ roots.T / np.sqrt(np.abs(gains).sum(1) + FAINT * gains.shape[1])
 
 
 def interval_of(solution: Solution, problem: Problem) -> np.ndarray:

@@ -109,7 +109,10 @@ class Search:
             self.on_progress(f"round {number}", 0, 1, f"{shape.label} by another state")
             before = held_out(self.problem, solution)
             responses = places.respond(self.problem, solution)
-            return self._curves(solution, responses, before, _surfaces(shape))
+            others = [state for state in PER if state != shape.coordinate]
+            # With the shape, a surface over both.
+            by = [terms.curve(shape.what, shape.coordinate, *shape.knots, by=state) for state in others]
+            return self._curves(solution, responses, before, by)
         have = {t.label for t in solution.model.terms}
         before = held_out(self.problem, solution)
         untried = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
@@ -171,16 +174,17 @@ class Search:
         starts = starts or [np.append(solution.values, s) for s in term.starts]
         share, scaled = promise or self._promise(solution, term, starts)
         # Chance alone lowers the error by the number of parameters over that of the errors.
-        promising = bool(share.max() >= FAINT + term.size / solution.linear.residual.size)
-        if not promising:
+        if share.max() < FAINT + term.size / solution.linear.residual.size:
             best = solve(self.problem, model, solution.theta, scaled[share.argmax()], iterations=1)
         else:
-            near = [starts[i] for i in np.argsort(-share)[:RACED] if share[i] >= NEAR * share.max()]
-            first = [solve(self.problem, model, solution.theta, s, iterations=5) for s in near]
+            promising = [starts[i] for i in np.argsort(-share)[:RACED] if share[i] >= NEAR * share.max()]
+            first = [solve(self.problem, model, solution.theta, s, iterations=5) for s in promising]
             best = min(first, key=lambda s: s.cost)
-            if promising := 0.5 * np.log(solution.cost / best.cost) >= worth:
+            if 0.5 * np.log(solution.cost / best.cost) >= worth:
                 best = solve(self.problem, model, best.theta, best.values, iterations=8)
-        return Scored(term, best, log_gain(before, held_out(self.problem, best, exact=promising)))
+        # What gains too little on the very data gains no more without a run.
+        able = 0.5 * np.log(solution.cost / best.cost) >= max(worth, WORTH)
+        return Scored(term, best, log_gain(before, held_out(self.problem, best, exact=able)))
 
     def _promise(
         self, solution: Solution, term: Term, begin: Sequence[np.ndarray] | None = None
@@ -311,12 +315,6 @@ class Search:
 def _worth(scored: Sequence[Scored]) -> float:
     """Return the gain in log RMSE below which a candidate stays far behind the best of those found."""
     return NEAR * max((float(s.gains.mean()) for s in scored), default=0.0)
-
-
-def _surfaces(shape: Term) -> list[Term]:
-    """Return curves like a shape, each proportional to another state: with the shape, a surface over both."""
-    others = [state for state in PER if state != shape.coordinate]
-    return [terms.curve(shape.what, shape.coordinate, *shape.knots, by=state) for state in others]
 
 
 def _line(responses: places.Responses, term: Term) -> tuple[np.ndarray, np.ndarray]:

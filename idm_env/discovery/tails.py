@@ -28,8 +28,7 @@ class Worst:
 
 def _relative(rows: Rows, error: np.ndarray) -> np.ndarray:
     square = error**2 + FLOOR_M**2
-    relative: np.ndarray = square / by_group(rows, square)
-    return relative
+    return np.asarray(square / by_group(rows, square))
 
 
 def concentration(rows: Rows, error: np.ndarray) -> float:
