@@ -87,12 +87,14 @@ def main(
         rows.append((f"PPO, seed {seed}", policy, seconds))
     cells, other = [], None
     for name, policy, seconds in rows:
-        each = delays(made(episodes, **keywords), policy, FRESH)
+        env, start = made(episodes, **keywords), time.process_time()
+        each = delays(env, policy, FRESH)
+        speed = episodes * env.task.horizon / (time.process_time() - start)
         other = each if other is None else other
-        cells.append([name, f"{each.mean():.1f}", interval(each - other), f"{seconds:.0f}"])
+        cells.append([name, f"{each.mean():.1f}", interval(each - other), f"{seconds:.0f}", f"{speed:.0f}"])
         print(*cells[-1], flush=True)
     print()
-    print(table(["", "delay (s)", "beside human", "CPU s"], cells))
+    print(table(["", "delay (s)", "beside human", "CPU s", "env steps per CPU s"], cells))
 
 
 if __name__ == "__main__":
