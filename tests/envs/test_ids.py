@@ -11,7 +11,11 @@ IDS = {task: idm_env._task_id(task) for task in TASKS}
 
 def test_ids_are_those_of_the_tasks() -> None:
     """No task without an id, no id without a task, and the words of a name each with a capital."""
-    assert {name for name in gym.registry if name.startswith("DiffIDM/")} == {*IDS.values(), "DiffIDM/Signals-v0"}
+    assert {name for name in gym.registry if name.startswith("DiffIDM/")} == {
+        *IDS.values(),
+        "DiffIDM/Signals-v0",
+        "DiffIDM/Junction-v0",
+    }
     assert IDS["ring"] == "DiffIDM/Ring-v0" and IDS["open_highway"] == "DiffIDM/OpenHighway-v0"
 
 
