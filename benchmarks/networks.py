@@ -69,9 +69,10 @@ def routes_xml(network: Network, demand: Demand) -> str:
     """Return a demand as SUMO's vehicles of one type, at the limit when they enter."""
     rows = []
     for i, (route, depart) in enumerate(zip(demand.route, demand.depart, strict=True)):
-        edges = " ".join(network.edge[k] for k in demand.routes[route] if k >= 0 and not network.inner[k])
+        links = [network.edge[k] for k in demand.routes[route] if k >= 0 and not network.inner[k]]
+        edges = " ".join(edge for edge, before in zip(links, ["", *links], strict=False) if edge != before)
         rows.append(
-            f'<vehicle id="{i}" type="t0" depart="{depart:.2f}" departSpeed="max" departPos="0">'
+            f'<vehicle id="{i}" type="t0" depart="{depart:.2f}" departSpeed="max" departPos="0" departLane="best">'
             f'<route edges="{edges}"/></vehicle>'
         )
     return f"<routes>{vehicle_type(0, TOP)}{''.join(rows)}</routes>"
@@ -207,7 +208,7 @@ def control(flow: float = 250.0, left: float = 0.1, seed: int = 1) -> None:
     text = generated(GRID)
     network = network_of(text)
     demand = Demand.by_turns(network, flow, SECONDS, seed=seed, shares=(left, 0.8 - left, 0.2))
-    free = np.array([(network.length[r] / network.limit[r]).sum() for r in (x[x >= 0] for x in demand.routes)])
+    free = network.times(demand.routes).sum(1)
     head(f"Delay per vehicle (s), {flow:g} vehicles/h an entry, {left:.0%} of turns left")
     rows = []
     for name, least in (("by the clock", None), *((f"max pressure, least green {g} s", float(g)) for g in (5, 10, 15))):

@@ -139,7 +139,7 @@ class _Traffic:
         links["mean_speed_mps"] = [s / n if n else None for s, n in zip(speed.tolist(), vehicles.tolist(), strict=True)]
         ways, dt = junctions.journeys_of(self.state), self.simulator.dt
         used = [row[row >= 0] for row in demand.routes]
-        free = np.array([(network.length[r] / network.limit[r]).sum() for r in used])
+        free = network.times(demand.routes).sum(1)
         ends = (("from", 0), ("to", -1))
         trips: dict[str, Any] = {name: [network.edge[used[r][k]] for r in demand.route] for name, k in ends}
         trips["due_s"] = demand.depart

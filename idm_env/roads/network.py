@@ -232,11 +232,23 @@ class Network(Road):
 
     @cached_property
     def follows(self) -> Array:
-        """Pairs of links of which one follows the other (K, 2), sorted."""
+        """Pairs of links of which one follows the other, or is outside junctions the lane beside it (K, 2), sorted."""
         table = np.concatenate((self.start[:, None], self.path, self.end[:, None]), 1)
         ways = [way[way >= 0].tolist() for way in table]
+        ways += [[k, other, k] for k, other in enumerate(self.left.tolist()) if other >= 0 and not self.inner[k]]
         pairs = {pair for way in ways for pair in pairwise(way)}
         return np.array(sorted(pairs), np.int64).reshape(-1, 2)
+
+    def times(self, routes: Array) -> Array:
+        """Return the time at the limits on each link of routes ``(R, H)`` (s), 0 where one goes on to that beside."""
+        after = np.pad(routes[:, 1:], ((0, 0), (0, 1)), constant_values=NONE)
+        aside = (after >= 0) & ((self.left[routes] == after) | (self.right[routes] == after))
+        return np.where((routes >= 0) & ~aside, (self.length / self.limit)[routes], 0.0)
+
+    @cached_property
+    def cramped(self) -> Array:
+        """Whether a link is too short to stop at its end at the limit, in an emergency, and to leave room (L)."""
+        return self.length < 15.0 + self.limit**2 / 18.0
 
     @cached_property
     def shows(self) -> tuple[Array, Array]:
@@ -311,7 +323,7 @@ def _check_links(net: Network) -> None:
         others = getattr(net, name)
         _in_range(net, name, others, links, lambda k: f"link '{net.names[k]}'")
         for k in np.flatnonzero(others >= 0):
-            if getattr(net, back)[others[k]] != k:
+            if getattr(net, back)[others[k]] != k or net.inner[others[k]] != net.inner[k]:
                 raise ValueError(f"link '{net.names[k]}': '{net.names[others[k]]}' is {name} of it, and not it {back}.")
 
 

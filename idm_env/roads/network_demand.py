@@ -94,7 +94,10 @@ class Demand:
                 raise ValueError(f"route {r}: {shown(self.routes[r].tolist())} must be links from 0 to {links - 1}.")
             for i in np.flatnonzero(~np.isin(way[:-1] * links + way[1:], pairs)):
                 a, b = (network.names[way[j]] for j in (i, i + 1))
-                raise ValueError(f"route {r}: link '{b}' does not follow '{a}'.")
+                raise ValueError(f"route {r}: link '{b}' does not follow '{a}', nor is it the lane beside.")
+            for k in way[:-1][(network.times(way[None])[0, :-1] == 0.0) & network.cramped[way[:-1]]]:
+                a, length = network.names[k], network.length[k]
+                raise ValueError(f"route {r}: link '{a}' ({length:g} m) is too short for a change at its limit.")
             if network.inner[way[0]] or network.inner[way[-1]]:
                 raise ValueError(f"route {r}: must begin and end outside junctions.")
             for m in np.unique(network.move_of[way[network.inner[way]]]):

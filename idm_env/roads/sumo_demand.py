@@ -27,7 +27,8 @@ from idm_env.roads.ways import Route, Ways, arrivals, keyed
 PARAMETERS = {"accel": "max_accel", "decel": "comfort_decel", "tau": "time_gap", "minGap": "min_gap"}
 PARAMETERS |= {"maxSpeed": "desired_speed"}
 """SUMO's attribute → IDM's parameter: m/s², m/s², s, m, m/s."""
-MOST_VEHICLES = 5_000_000
+MOST_VEHICLES, VARIANTS = 5_000_000, 8
+"""Most that are read, and over how many choices of lanes a route leads that several may take."""
 Spread = tuple[float, float, float, float]
 """Mean, deviation and bounds of what share of limits vehicles drive."""
 CAR = (5.0, 2.6, 4.5, 55.56)
@@ -64,7 +65,7 @@ class _Reader:
 
     def __init__(self, network: Network, seed: int, end: float) -> None:
         self.ways, self.limit, self.seed, self.end = Ways(network), network.limit.tolist(), seed, end
-        self.skipped: Counter[str] = Counter()
+        self.skipped, self.variants = Counter[str](), VARIANTS if (network.left >= 0).any() else 1
         self.kinds: list[dict[str, float]] = []
         self.known: dict[str, dict[str, list[tuple[float, Any]]]] = {"vType": {}, "route": {}}
         self.numbers: dict[Route, int] = {}
@@ -87,7 +88,8 @@ class _Reader:
         """Return the types or routes that an element stands for, each with its weight, and keep them by its id."""
         if element.tag == kind:
             make = self._type_of if kind == "vType" else self._route_of
-            pairs = [(number(element, "probability", 1.0, 0.0), make(element, owner or name(element)))]
+            weight, many = number(element, "probability", 1.0, 0.0), self.variants if kind == "route" else 1
+            pairs = [(weight, make(element, owner or name(element))) for _ in range(many)]
         else:
             keys = element.get(f"{kind}s", "").split()
             weights = element.get("probabilities", "1 " * len(keys)).split()
@@ -151,6 +153,9 @@ class _Reader:
             if one is None:
                 self.skipped[f"vehicles of type {key}, which is no car's"] += 1
                 continue
+            if not route:
+                self.skipped["vehicles that must change lanes on a link too short for it"] += 1
+                continue
             speed = self._entry_speed(element, self.kinds[one[0]]["idm.desired_speed"], self.limit[route[0]], random)
             kind = self._driver(one[0], round(_draw_share(one[2], shares), 3))
             self.rows.append((self.numbers.setdefault(route, len(self.numbers)), depart, speed, one[1], kind))
@@ -174,7 +179,8 @@ class _Reader:
             return self._named("route", element.attrib["route"], element)
         if {"from", "to"} <= element.attrib.keys():
             stops = [element.attrib["from"], *element.get("via", "").split(), element.attrib["to"]]
-            return [(1.0, self.ways.quickest(stops, name(element)))]
+            many = self.variants if element.tag == "flow" else 1
+            return [(1.0, self.ways.quickest(stops, name(element))) for _ in range(many)]
         if not any(key.startswith(("from", "to")) for key in element.attrib):
             raise ValueError(f"{name(element)} has no route. Give it a route, or from and to.")
         self.skipped[f"{element.tag}s between districts or junctions"] += 1

@@ -18,8 +18,10 @@ from idm_env import validation
 from idm_env.roads.network import Network, padded
 
 Route = tuple[int, ...]
-CHANGE_S = 1.0
-"""Cost of a change to the lane beside in the choice of lanes (s)."""
+CHANGE_S, NEVER_S = 1.0, 1e6
+"""Cost of a change to the lane beside in the choice of lanes (s), on a long link and on one too short for it."""
+BALANCE_S = 5.0
+"""Cost of a lane that all have taken before (s), where none has taken that beside."""
 STRAIGHT = math.radians(45.0)
 MOST_MOVES = 200
 """A route that has not left the network after so many moves is drawn again."""
@@ -32,6 +34,8 @@ class Ways:
         self.network = network
         self.beside = network.left.tolist(), network.right.tolist()
         self.time = (network.length / network.limit).tolist()
+        self.change = np.where(network.cramped, NEVER_S, CHANGE_S * (1.0 + 100.0 / network.length)).tolist()
+        self.taken = [0] * len(network.names)
         self.lanes: dict[str, list[int]] = {}
         for link in np.flatnonzero(~network.inner).tolist():
             self.lanes.setdefault(network.edge[link], []).append(link)
@@ -49,18 +53,26 @@ class Ways:
         return self.lanes[edge]
 
     def route_along(self, edges: Sequence[str], owner: str) -> Route:
-        """Return the route along edges with the fewest changes of lanes. ValueError where two do not connect."""
+        """Return the route along edges with few changes of lanes, which avoids those that earlier ones have taken.
+
+        It is empty where a link is too short for its changes. ValueError where two edges do not connect.
+        """
         routes: dict[int, tuple[float, Route]] = {link: (0.0, (link,)) for link in self.lanes_of(edges[0], owner)}
         for edge, following in pairwise(edges):
             lanes, onward = set(self.lanes_of(following, owner)), dict[int, tuple[float, Route]]()
+            taken = 1 + sum(self.taken[link] for link in self.lanes[edge])
             for cost, route in self._on_all_lanes(routes):
+                cost += BALANCE_S * self.taken[route[-1]] / taken
                 for end, path, _ in self.moves[route[-1]]:
                     if end in lanes and cost < onward.get(end, (math.inf,))[0]:
                         onward[end] = cost, (*route, *path, end)
             if not onward:
                 raise ValueError(f"{owner}: edge '{edge}' does not lead to '{following}'. Give edges that connect.")
             routes = onward
-        return min(routes.values())[1]
+        cost, route = min(routes.values())
+        for link in route:
+            self.taken[link] += 1
+        return route if cost < NEVER_S else ()
 
     def _on_all_lanes(self, routes: Mapping[int, tuple[float, Route]]) -> list[tuple[float, Route]]:
         """Return routes, and with them those that go on to the lanes beside."""
@@ -68,12 +80,12 @@ class Ways:
         for side in self.beside:
             for cost, route in routes.values():
                 while (lane := side[route[-1]]) >= 0:
-                    cost, route = cost + CHANGE_S, (*route, lane)
+                    cost, route = cost + self.change[route[-1]], (*route, lane)
                     longer.append((cost, route))
         return longer
 
     def quickest(self, stops: Sequence[str], owner: str) -> Route:
-        """Return the quickest route at the limits over some edges; ValueError where there is none."""
+        """Return the quickest route at the limits over some edges, as ``route_along``; ValueError for none."""
         self.lanes_of(stops[0], owner)
         edges = [stops[0]]
         for start, end in pairwise(stops):
@@ -121,18 +133,21 @@ class Ways:
         turns = ((angle + math.pi) % (2.0 * math.pi) - math.pi for angle in angles)
         return [0 if turn > STRAIGHT else 2 if turn < -STRAIGHT else 1 for turn in turns]
 
-    def draw_route(self, link: int, shares: Sequence[float], random: np.random.Generator) -> Route:
-        """Return a route from a link to where no move leads on. ValueError where none seems to do so."""
+    def _turns(self, edge: str) -> dict[str, int]:
+        onward = (move for lane in self.lanes[edge] for move in self.moves[lane])
+        return {self.network.edge[end]: self.sides[move] for end, _, move in onward}
+
+    def draw_route(self, edge: str, shares: Sequence[float], random: np.random.Generator) -> Route:
+        """Return a route from an edge to where no move leads on. ValueError where none seems to do so."""
         for _ in range(100):
-            route = [link]
-            while (moves := self.moves[route[-1]]) and len(route) < 2 * MOST_MOVES:
-                sides = [self.sides[move] for *_, move in moves]
+            edges = [edge]
+            while (turns := self._turns(edges[-1])) and len(edges) < MOST_MOVES:
+                sides = [*turns.values()]
                 weights = [shares[side] / sides.count(side) + 1e-9 for side in sides]
-                end, path, _ = moves[bisect(sums := list(accumulate(weights)), random.random() * sums[-1])]
-                route += [*path, end]
-            if not moves:
-                return tuple(route)
-        raise ValueError(f"no way leads out of the network from '{self.network.edge[link]}'. Give vehicles routes.")
+                edges.append([*turns][bisect(sums := list(accumulate(weights)), random.random() * sums[-1])])
+            if not turns and (route := self.route_along(edges, f"a way from '{edge}'")):
+                return route
+        raise ValueError(f"no way leads out of the network from '{edge}'. Give vehicles routes.")
 
 
 def _heading(points: np.ndarray, piece: int) -> float:
@@ -165,7 +180,7 @@ def draw_turns(
         validation.in_interval(f"per_hour of {edge}", float(rate), 0.0, 1e5, "1/h")
         random = keyed(seed, edge)
         for time in arrivals(rate / 3600.0, 0.0, seconds, random):
-            links = ways.draw_route(ways.entries[edge], shares, random)
+            links = ways.draw_route(edge, shares, random)
             route.append(numbers.setdefault(links, len(numbers)))
             depart.append(time)
     return {"routes": padded(list(numbers)), "route": route, "depart": depart}

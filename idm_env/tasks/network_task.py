@@ -170,8 +170,8 @@ class NetworkTask:
             return self._read[1]
         # As many routes of every entry as of any other: whoever arrives takes one of all.
         routes = [
-            self._ways.draw_route(link, self.turns, random)
-            for edge, link in self._ways.entries.items()
+            self._ways.draw_route(edge, self.turns, random)
+            for edge in self._ways.entries
             for random in [keyed(0, edge)]
             for _ in range(_ROUTES)
         ]
@@ -180,8 +180,7 @@ class NetworkTask:
     @cached_property
     def _free_times(self) -> tuple[Array, Array]:
         """Time at the limits before each link of a route, and on all of it (s): ``(R, H)`` and ``(R,)``."""
-        routes, net = self._demand.routes, self.road
-        each = np.where(routes >= 0, (net.length / net.limit)[routes], 0.0)
+        each = self.road.times(self._demand.routes)
         total = each.cumsum(1)
         return total - each, total[:, -1]
 

@@ -26,12 +26,13 @@ TAG += ("new", "gate", "here", "order", "waits")
 order and in that of links, and for whom a vehicle waits at its gate (−1: for no vehicle)."""
 POSITION, SPEED, ACCEL, GAP, LENGTH, PRESENT, ASKS, STOP, LIMIT, BASE, MOVED, ENTERING, LINE, LATER = range(len(CAR))
 LINK, LEADER, FOLLOWER, ROUTE, HOP, TOLD, RESERVED, DUE, ENTERED, LEFT, NEW, GATE, HERE, ORDER, WAITS = range(len(TAG))
-LONG, FAST, TRAIL_BASE, HEADING = range(4)
-"""Of links, numbers: length and limit, the way to the link of the vehicle whose rear is there, and how much is on its
-way there through a junction (m)."""
-OPENS, MOVE_OF, BEFORE, COUNT, BEGIN, TAIL, TRAIL, QUEUE = range(8)
-"""Of links, whole numbers: the move that begins with it, or that it is a part of; whether a gate is at its end; how
-many are there, where they begin in the order, who is the last, whose rear is there, and whether somebody waits."""
+LONG, FAST, TRAIL_BASE, HEADING, UNGUARDED = range(5)
+"""Of links, numbers: length and limit, the way to the link of the vehicle whose rear is there, how much is on its
+way there through a junction (m), and whether one comes there without a gate (1)."""
+OPENS, MOVE_OF, BESIDE, COUNT, BEGIN, TAIL, TRAIL, QUEUE = range(8)
+"""Of links, whole numbers: the move that begins with it (``GATED``: a gate is at its end), or that it is a part of; the
+lane to the left; how many are there, where they begin in the order, who is the last, whose rear is there, and
+whether somebody waits, or (2) has come from beside."""
 START, END, SIGNAL, INDEX, SHOWN, INSIDE, COMING, HOLDER = range(8)
 """Of moves, whole numbers: their links, signal and index, what it shows, how many are inside or have reserved, one who
 arrives within t_c (his slot and 1, 0 for nobody), and one of those inside."""
@@ -42,13 +43,16 @@ TIME_GAP, LEAST, BRAKE = range(3)
 W, K = 16, 8
 """Columns of vehicles, and of links and moves: what one needs is on two lines of a cache. Tables are handed on as
 pointers: numba counts references to arrays at every call, which costs more than most of what is done here."""
-NONE = -1
+NONE, GATED, ASIDE = -1, -2, -2
+"""No move; a gate at the end; the next that comes is no gate, but a change to the lane beside."""
 RED, GREEN, AMBER, YIELD = range(4)
 FREE, STOPS, CLEARS = range(3)
 """What a driver is told: nothing; to stop; and that he counts as inside, so that in red he goes before his foes."""
 FAR, OPEN = 1e4, 1e6
 STANDS = 1.0
 """Speed below which whoever is behind a junction may not make room in time (m/s)."""
+SETBACK = 12.0
+"""Whoever must go to the right stops so far before the end of his lane (m): who comes from there finds room ahead."""
 SAME, LED, CAME, CAME_BEHIND = range(4)
 """What is new of a vehicle: nothing, its leader, itself, itself at its leader's speed."""
 
@@ -61,6 +65,11 @@ def event(step, dt, anew, sizes, tables, plans, phases):
     n = travel(step, anew, sizes, car, tag, road, site, move, routes)
     n = enter(step, n, sizes, car, tag, road, site, move, routes, rules, driver)
     sort(n, sizes[LINKS], car, tag, site)
+    if change(n, sizes, car, tag, road, site, routes, rules, driver):
+        sort(n, sizes[LINKS], car, tag, site)
+        for k in range(sizes[LINKS]):
+            p = site[K * k + K + BEGIN] - 1
+            site[K * k + TAIL] = tag[W * p + ORDER] if p >= site[K * k + BEGIN] else NONE
     follow(n, sizes, car, tag, road, site, routes, rules)
     guard(n, sizes, car, tag, road, site, move, against, routes, rules, driver)
     return n
@@ -87,6 +96,12 @@ def show(time, moves, move, plans, phases):
 def next_link(i, h, wide, tag, routes):
     """Return link ``h`` of a vehicle's route, −1 behind its end."""
     return routes[tag[W * i + ROUTE] * wide + h] if h < wide else NONE
+
+
+@exact
+def is_beside(k, then, site):
+    """Whether a link, if it is any, is the lane beside another."""
+    return then >= 0 and (site[K * k + BESIDE] == then or site[K * then + BESIDE] == k)
 
 
 @exact
@@ -130,9 +145,12 @@ def travel(step, anew, sizes, car, tag, road, site, move, routes):
             continue
         k, h, far, x = tag[W * i + LINK], tag[W * i + HOP], road[LONG] - road[LONG], car[W * i + POSITION]
         while x - far >= road[K * k + LONG]:
+            then = next_link(i, h + 1, sizes[WIDE], tag, routes)
+            if is_beside(k, then, site):
+                break
             h += 1
             far += road[K * k + LONG]
-            k = next_link(i, h, sizes[WIDE], tag, routes)
+            k = then
             if k < 0:
                 break
             if site[K * k + OPENS] >= 0:
@@ -147,7 +165,7 @@ def travel(step, anew, sizes, car, tag, road, site, move, routes):
         tag[W * n + HERE] = i
         n += 1
         put_on_link(i, sizes[WIDE], car, tag, road, site, move, routes)
-        if far > 0 or anew:
+        if far > 0 or anew or tag[W * i + GATE] == ASIDE:
             find_gate(i, sizes[WIDE], car, tag, road, site, routes)
         if tag[W * i + RESERVED]:
             reserve(i, tag[W * i + GATE], 1, car, tag, road, move)
@@ -179,17 +197,22 @@ def leader_ahead(i, reach, wide, car, tag, road, site, routes):
 @exact
 def find_gate(i, wide, car, tag, road, site, routes):
     """Find a vehicle's next move, −1 for none, and the way to its line from the beginning of his link; and a limit."""
-    way, h = road[K * tag[W * i + LINK] + LONG], tag[W * i + HOP] + 1
+    own, way, h = tag[W * i + LINK], road[K * tag[W * i + LINK] + LONG], tag[W * i + HOP] + 1
     k = next_link(i, h, wide, tag, routes)
     car[W * i + LATER], tag[W * i + GATE] = road[K * (max(k, 0)) + FAST] if k >= 0 else FAR, NONE
     while k >= 0:
         if site[K * k + OPENS] >= 0:
             tag[W * i + GATE] = site[K * k + OPENS]
             break
+        if is_beside(own, k, site):
+            tag[W * i + GATE] = ASIDE
+            break
         way += road[K * k + LONG]
         h += 1
-        k = next_link(i, h, wide, tag, routes)
+        own, k = k, next_link(i, h, wide, tag, routes)
     car[W * i + LINE] = way
+    if tag[W * i + GATE] == ASIDE and site[K * k + BESIDE] == own:
+        car[W * i + LINE] -= SETBACK
 
 
 @exact
@@ -248,6 +271,72 @@ def entry(i, j, base, each, car, driver):
 
 
 @exact
+def change(n, sizes, car, tag, road, site, routes, rules, driver):
+    """Move whoever has to and finds room to the lane beside, one to each lane; return whether anybody has changed.
+
+    ::
+
+        s − (1 + u) s0 / 2 ≥ u v T    and    v² − v_l² ≤ 2 b (s − (1 + u) s0 / 2)
+
+    to the new leader and of the new follower, with u = min(1, s_line / reach): the nearer the end, the less is enough.
+    Where somebody is about to come from behind the lane, one is taken to be at its beginning, as fast as may be.
+    The first who can stops behind somebody who stands at the end of his lane.
+    """
+    some, each = False, sizes[EACH]
+    for q in range(n):
+        i = tag[W * q + ORDER]
+        k, to = tag[W * i + LINK], next_link(i, tag[W * i + HOP] + 1, sizes[WIDE], tag, routes)
+        v, room, shift = car[W * i + SPEED], car[W * i + LINE] - car[W * i + POSITION], car[W * i + MOVED]
+        if tag[W * i + GATE] != ASIDE or tag[W * i + NEW] >= CAME or shift > 0 or not is_beside(k, to, site):
+            continue
+        shift = car[W * i + POSITION] - car[W * i + POSITION] * road[K * to + LONG] / road[K * k + LONG]
+        x, p, end = car[W * i + POSITION] - shift, site[K * to + BEGIN], site[K * to + K + BEGIN]
+        share = min(1, max(0, room / rules[REACH]))
+        while p < end and car[W * tag[W * p + ORDER] + POSITION] >= x:
+            p += 1
+        base, rear, late = shift - shift, x - car[W * i + LENGTH], road[K * to + HEADING] + road[K * to + UNGUARDED] > 0
+        if p < end:
+            j = tag[W * p + ORDER]
+            gap, late = rear - car[W * j + POSITION], tag[W * j + RESERVED] > 0
+            late = late or not fits(j, gap, car[W * j + SPEED], v, share, each, driver)
+        elif late:
+            late = not fits(i, rear, road[K * to + FAST], v, share, each, driver)
+        tag[W * i + HOP], tag[W * i + LINK] = tag[W * i + HOP] + 1, to
+        if p > site[K * to + BEGIN]:
+            ahead = tag[W * p - W + ORDER]
+        else:
+            ahead, base = leader_ahead(i, rules[REACH], sizes[WIDE], car, tag, road, site, routes)
+        late = late or rear < 0 or site[K * to + QUEUE] == 2 or v * v * rules[BRAKING] > road[K * to + LONG] - x
+        if ahead >= 0 and not late:
+            gap = base + car[W * ahead + POSITION] - car[W * ahead + LENGTH] - x
+            late = not fits(i, gap, v, car[W * ahead + SPEED], share, each, driver)
+        if late:
+            tag[W * i + HOP], tag[W * i + LINK] = tag[W * i + HOP] - 1, k
+            while v < STANDS and room < SETBACK and p < end:
+                j, p = tag[W * p + ORDER], p + 1
+                if car[W * j + POSITION] + car[W * j + SPEED] * car[W * j + SPEED] * rules[BRAKING] <= rear:
+                    if not tag[W * j + RESERVED]:
+                        tag[W * j + GATE], car[W * j + LINE] = ASIDE, min(car[W * j + LINE], rear)
+                    break
+            continue
+        car[W * i + POSITION], car[W * i + MOVED], tag[W * i + NEW], tag[W * i + TOLD] = x, shift, LED, FREE
+        find_gate(i, sizes[WIDE], car, tag, road, site, routes)
+        site[K * to + QUEUE], some = 2, True
+        if p == end:
+            site[K * to + TAIL] = i
+        site[K * to + COUNT], site[K * k + COUNT] = site[K * to + COUNT] + 1, site[K * k + COUNT] - 1
+    return some
+
+
+@exact
+def fits(i, room, v, v_l, share, each, driver):
+    """Whether a vehicle of speed ``v`` may be so far behind one of speed ``v_l``."""
+    d = i if each > 1 else 0
+    room -= 0.5 * (1 + share) * driver[LEAST * each + d]
+    return room >= share * v * driver[TIME_GAP * each + d] and v * v - v_l * v_l <= 2 * driver[BRAKE * each + d] * room
+
+
+@exact
 def sort(n, links, car, tag, site):
     """Put those who are here in the order of their links, front first; those of link ``k`` begin at ``begin[k]``."""
     p = 0
@@ -299,11 +388,13 @@ def guard(n, sizes, car, tag, road, site, move, against, routes, rules, driver):
         look_ahead(tag[W * q + ORDER], sizes, car, tag, road, site, move, routes, rules, driver)
     for turn in range(2):  # those on links before gates, then those who are further behind
         for k in range(sizes[LINKS]):
-            if site[K * k + BEFORE] == turn:
+            if (site[K * k + OPENS] == GATED) == turn:
                 continue
             for q in range(site[K * k + BEGIN], site[K * (k + 1) + BEGIN]):
                 i = tag[W * q + ORDER]
                 m = tag[W * i + GATE]
+                if m == ASIDE:
+                    break
                 if m < 0 or tag[W * i + RESERVED]:
                     continue
                 if turn == 1 and q == site[K * k + BEGIN] and waits_behind(i, m, car, tag):
@@ -330,6 +421,8 @@ def look_ahead(i, sizes, car, tag, road, site, move, routes, rules, driver):
     tag[W * i + WAITS] = NONE
     car[W * i + LIMIT], slower = road[K * k + FAST], car[W * i + LATER] < min(v, road[K * k + FAST])
     car[W * i + STOP] = road[K * k + LONG] if slower else OPEN
+    if m == ASIDE and room < 2 * v * v * rules[BRAKING] + SETBACK:
+        car[W * i + STOP] = min(car[W * i + STOP], car[W * i + LINE])
     if m < 0:
         return
     j = tag[W * i + LEADER]

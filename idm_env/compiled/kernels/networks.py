@@ -18,7 +18,7 @@ from torch import Tensor
 
 from idm_env.compiled.kernels import lanes, network_rows, threads as pool, tiles
 from idm_env.compiled.kernels.memory import addresses
-from idm_env.compiled.kernels.network_loops import CAR, TAG, K, W
+from idm_env.compiled.kernels.network_loops import CAR, GATED, TAG, K, W
 from idm_env.compiled.kernels.network_rows import LEADS, LED, Operands
 from idm_env.compiled.kernels.operands import operand, table
 from idm_env.compiled.kernels.printed import TileKernel, tile_kernel
@@ -114,9 +114,10 @@ def _tables(network: Network, kind: np.dtype) -> tuple[Any, ...]:
     links, moves = len(network.names), len(network.start)
     road, site = np.zeros((links, K), kind), np.zeros((links + 1, K), np.int32)
     road[:, 0], road[:, 1] = network.length, network.limit
-    gated = np.flatnonzero(network.path[:, 0] >= 0)
-    site[:, 0] = -1
-    site[network.path[gated, 0], 0], site[:-1, 1], site[network.start[gated], 2] = gated, network.move_of, 1
+    gated, open_ways = (np.flatnonzero((network.path[:, 0] >= 0) == x) for x in (True, False))
+    road[network.end[open_ways], 4] = 1.0
+    site[:, 0], site[:-1, 1], site[:-1, 2] = -1, network.move_of, np.where(network.inner, -1, network.left)
+    site[network.start[gated], 0], site[network.path[gated, 0], 0] = GATED, gated
     move = np.zeros((moves, K), np.int32)
     move[:, :4] = np.stack((network.start, network.end, network.signal, network.index), 1)
     against = np.full((2, moves, max(network.foes.shape[1], network.yields.shape[1])), -1, np.int32)
