@@ -162,6 +162,9 @@ def travel(seeds: int = 3, shorter: bool = False) -> None:
     flows = (200.0, 300.0, 400.0, 500.0, 600.0), (100.0, 150.0, 200.0, 250.0, 300.0), (100.0, 200.0, 300.0)
     cases = [("grid, no left turns", grid, (0.0, 0.8, 0.2), flows[0])]
     cases += [("grid, 20 % left", grid, (0.2, 0.6, 0.2), flows[1])]
+    double = generated(GRID.replace("-L 1", "-L 2"))
+    cases += [("two lanes, no left turns", double, (0.0, 0.8, 0.2), (300.0, 600.0, 900.0))]
+    cases += [("two lanes, 20 % left", double, (0.2, 0.6, 0.2), (200.0, 400.0, 600.0))]
     cases += [
         (f"random {k}", generated(RANDOM.format(seed=k)), (0.25, 0.5, 0.25), flows[2]) for k in range(1, 1 + seeds)
     ]
