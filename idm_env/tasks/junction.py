@@ -129,12 +129,12 @@ class JunctionTask(NetworkTask):
     def _gates(self) -> tuple[Array, Array]:
         """The next move of each link of a route, −1 for none, and the way from the link's beginning to its line (m)."""
         routes, net = self._demand.routes, self.road
-        move, way = np.full(routes.shape, -1), np.full(routes.shape, 1e3)
+        move, way, own = np.full(routes.shape, -1), np.full(routes.shape, 1e3), net.times(routes) * net.limit[routes]
         for h in range(routes.shape[1] - 2, -1, -1):
             then = net.move_of[routes[:, h + 1]]
             opens = (routes[:, h + 1] >= 0) & (then >= 0) & (net.path[then, 0] == routes[:, h + 1])
             move[:, h] = np.where(opens, then, move[:, h + 1])
-            way[:, h] = net.length[routes[:, h]] + np.where(opens, 0.0, way[:, h + 1])
+            way[:, h] = own[:, h] + np.where(opens, 0.0, way[:, h + 1])
         return move, way
 
     # -- pure functions ----------------------------------------------------------------------------------------------
