@@ -15,7 +15,7 @@ from idm_env.discovery.closed_loop import GRID_S, further
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.noise import estimate, first_noise
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
-from idm_env.discovery.score import without
+from idm_env.discovery.score import left_out
 from idm_env.discovery.solve import Population, Problem, Solution, solve
 
 FOLDS = 4
@@ -38,7 +38,8 @@ def folds_of(runs: Sequence[str], kept: Sequence[str], seed: int) -> np.ndarray:
 def values_of(problem: Problem, solution: Solution, runs: Sequence[str], fold: np.ndarray) -> np.ndarray:
     """Return φ [folds, Q] without the runs of each fold; ``problem`` is what φ was fitted to, ``runs`` are all."""
     of_run = fold[[runs.index(run) for run in problem.rows.records.runs]]
-    return np.asarray(solution.values + without(problem, solution, of_run, int(fold.max()) + 1))
+    change = left_out(problem, solution, part=of_run)[0]
+    return np.asarray(solution.values + np.pad(change, ((0, int(fold.max()) + 1 - len(change)), (0, 0))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,27 +95,25 @@ def without(problem: Problem, solution: Solution, part: np.ndarray, parts: int) 
     return change
 
 
-def without_own_run(problem: Problem, solution: Solution) -> np.ndarray:
-    """Return by how much φ changes for every run [runs, Q] when that run is left out."""
-    runs = len(problem.rows.records.runs)
-    return without(problem, solution, np.arange(runs), runs)
+def left_out(
+    problem: Problem, solution: Solution, exact: bool = True, part: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``without`` [parts, Q], solved where that step is ``LONG``, and the numbers of these parts.
 
-
-def left_out(problem: Problem, solution: Solution, exact: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``without_own_run`` [runs, Q], solved where that step is ``LONG``, and the numbers of these runs.
-
-    In free simulation, and where drivers share θ across runs, none is; nor is any unless ``exact``.
+    Every run is a part of its own unless ``part`` [runs] says otherwise. In free simulation, and where drivers share θ
+    across runs, none is solved; nor is any unless ``exact``.
     """
-    change, rows = without_own_run(problem, solution), problem.rows
+    rows, runs = problem.rows, len(problem.rows.records.runs)
+    part = np.arange(runs) if part is None else part
+    change, of_row = without(problem, solution, part, int(part.max()) + 1), part[rows.run]
     if not exact or problem.noise is None or _spans_runs(problem):
         return change, np.zeros(0, int)
-    moved = np.einsum("rmq,rq->rm", projected(solution), change[rows.run])
-    size, whole = (np.bincount(rows.run, (x**2).sum(-1), len(change)) for x in (moved, solution.linear.residual))
+    moved = np.einsum("rmq,rq->rm", projected(solution), change[of_row])
+    size, whole = (np.bincount(of_row, (x**2).sum(-1), len(change)) for x in (moved, solution.linear.residual))
     far = np.flatnonzero(size > LONG**2 * whole)
-    for run in far:
-        others = problem.of_rows(rows.run != run)
-        fitted = solve(others, solution.model, solution.theta, solution.values, tolerance=1e-6)
-        change[run] = fitted.values - solution.values
+    for one in far:
+        fitted = solve(problem.of_rows(of_row != one), solution.model, solution.theta, solution.values, tolerance=1e-6)
+        change[one] = fitted.values - solution.values
     return change, far
 
 

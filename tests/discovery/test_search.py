@@ -12,7 +12,7 @@ import torch
 from scipy.stats import t as student
 
 from idm_env.data import episodes, synthetic
-from idm_env.discovery import model as terms, places, search, selection
+from idm_env.discovery import crossed, model as terms, places, search, selection
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.march import COLUMNS, PULSED
 from idm_env.discovery.model import Hypothesis
@@ -119,6 +119,8 @@ def test_the_run_that_decides_is_held_out_by_a_solution_on_the_others() -> None:
     exact = 0.5 * np.log(before[4] / (fixed.linear.residual**2).sum())
     assert gains[4] == pytest.approx(exact, abs=0.02) and gains[4] > -0.05
     assert log_gain(before, held_out(searching.problem, one, exact=False))[4] < -0.5
+    folds, runs = np.array([0, 0, 1, 1, 2]), searching.problem.rows.records.runs
+    assert crossed.values_of(searching.problem, one, runs, folds)[2] == pytest.approx(rest.values, rel=0.02, abs=1e-3)
 
 
 def test_a_curve_is_fitted_although_its_line_misses_one_run(monkeypatch: pytest.MonkeyPatch) -> None:
