@@ -1,4 +1,4 @@
-"""Laws on random networks: ``python studies/2026-11-27-networks/laws.py [--networks 54]``.
+"""Laws on random networks: ``python studies/2026-11-27-networks/laws.py [--networks 54 --lanes 1]``.
 
 Networks are netgenerate's, a third with signals everywhere, a third with signals where many roads meet, a sixth each
 by priority and right before left; 600 s of traffic that they cannot serve, in rows of other demand, every second
@@ -32,9 +32,9 @@ CAR: dict[str, float] = {"max_accel": 2.6, "comfort_decel": 4.5, "time_gap": 1.0
 SECONDS = 600
 
 
-def checked(seed: int, rows: int, flow: float) -> dict[str, Any]:
+def checked(seed: int, rows: int, flow: float, lanes: int) -> dict[str, Any]:
     """Return how many vehicle-steps of a network were looked at, and what was wrong."""
-    words = f"--rand --rand.iterations 40 -L 1 --no-turnarounds --seed {seed} {KINDS[seed % len(KINDS)]}"
+    words = f"--rand --rand.iterations 40 -L {lanes} --no-turnarounds --seed {seed} {KINDS[seed % len(KINDS)]}"
     network, begin = network_of(generated(words)), time.process_time()
     simulator = Simulator(network, (IDM(), StopLine(), LinkLimit(), Brakes()), 0.1)
     params: Any = simulator.defaults(dtype=torch.float32)
@@ -55,12 +55,14 @@ def checked(seed: int, rows: int, flow: float) -> dict[str, Any]:
             "broken": len(wrong), "first": wrong[:3]}  # fmt: skip
 
 
-def main(out: Path = Path("laws.jsonl"), networks: int = 54, rows: int = 4, flow: float = 300.0) -> None:
+def main(
+    out: Path = Path("laws.jsonl"), networks: int = 54, rows: int = 4, flow: float = 300.0, lanes: int = 1
+) -> None:
     """Check networks that the file lacks, and print the sums of all."""
     done = {row["seed"]: row for row in map(json.loads, out.read_text().splitlines())} if out.exists() else {}
     for seed in range(1, networks + 1):
         if seed not in done:
-            done[seed] = {"seed": seed, **checked(seed, rows, flow)}
+            done[seed] = {"seed": seed, **checked(seed, rows, flow, lanes)}
             with out.open("a") as file:
                 file.write(json.dumps(done[seed]) + "\n")
             print(done[seed], flush=True)
