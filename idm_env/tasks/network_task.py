@@ -146,17 +146,12 @@ class NetworkTask:
         """Slots: as many as arrive at most, but for once in 10⁹ episodes."""
         if self._read[1] is not None:
             return len(self._read[1].route)
-        mean = self.inflows[1] * self.duration / 3600.0 * len(self.entries)
+        mean = self.inflows[1] * self.duration / 3600.0 * len(self._ways.entries)
         return math.ceil(mean + 6.0 * math.sqrt(mean)) + 1
 
     @cached_property
     def _ways(self) -> Ways:
         return Ways(self.road)
-
-    @property
-    def entries(self) -> list[int]:
-        """Links at which vehicles arrive."""
-        return list(self._ways.entries.values())
 
     @property
     def is_closed(self) -> bool:
@@ -209,9 +204,9 @@ class NetworkTask:
             draw.stream(f"{self.name}.{what}").uniforms(0, n, torch.float64)
             for what, n in (("inflow", 1), ("gap", self.vehicles), ("route", self.vehicles))
         )
-        low, high = self.inflows
+        (low, high), entries = self.inflows, len(self._ways.entries)
         # Those who go round enter as soon as there is room.
-        rate = torch.ones_like(share) if self.is_closed else (low + (high - low) * share) * len(self.entries) / 3600.0
+        rate = torch.ones_like(share) if self.is_closed else (low + (high - low) * share) * entries / 3600.0
         due = (-gap.log()).cumsum(1) / (rate.clamp_min(1e-9) * self.simulator.dt)
         return (choice * len(self._demand.routes)).int(), due.ceil().clamp_max(NEVER).int()
 

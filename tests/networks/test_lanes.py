@@ -113,6 +113,22 @@ def test_routes_take_both_lanes_and_change_where_they_must() -> None:
     assert Ways(Network.from_tables(links, moves)).route_along(["before", "in", "out"], "test") == (4, 0, 1, 2, 3)
 
 
+def test_nobody_is_followed_to_the_lane_beside() -> None:
+    """Whoever comes to a lane from which he must change follows nobody who is ahead on the other one.
+
+    The way there was counted twice, and kept when the leader came over: they overlapped.
+    """
+    names = ["a", "b", "y", "d", "e"]
+    links = {"name": names, "length": [100.0] * 5, "limit": [13.89] * 5, "inner": [0, 0, 1, 0, 0]}
+    links |= {"edge": ["in", "in", "y", "out", "before"], "left": ["b", *[None] * 4], "right": [None, "a", *[None] * 3]}
+    moves = {"start": ["b", "e"], "end": ["d", "a"], "path": [["y"], []]}
+    simulator, params = simulated(Network.from_tables(links, moves))
+    demand = Demand(padded([(4, 0, 1, 2, 3), (1, 2, 3)]), np.arange(2), np.zeros(2))
+    state = travelling(simulator, demand, params, hop=[0, 0], position=[95.0, 30.0])
+    state, _ = simulator.rollout(state, {}, params, 1, keep=None)
+    assert state.lanes is not None and state.lanes.leader.tolist() == [0, 1]
+
+
 def test_a_lane_too_short_for_a_change_is_refused() -> None:
     """Whoever could not stop at its end would miss his way."""
     with pytest.raises(ValueError, match=r"^route 2: link 'a' \(25 m\) is too short for a change at its limit\.$"):

@@ -176,7 +176,8 @@ def travel(step, anew, sizes, car, tag, road, site, move, routes):
 def leader_ahead(i, reach, wide, car, tag, road, site, routes):
     """Return whom the first vehicle of a link follows, and the way from the beginning of his link to his leader's.
 
-    That is the next one along his route, or one whose rear is not yet on a way of his own. −1 for nobody.
+    That is the next one along his route, or one whose rear is not yet on a way of his own. −1 for nobody: on the lane
+    beside, to which he must change, nobody is ahead of him.
     """
     way, h, k = road[LONG] - road[LONG], tag[W * i + HOP], tag[W * i + LINK]
     while k >= 0 and way - car[W * i + POSITION] < reach:
@@ -190,7 +191,9 @@ def leader_ahead(i, reach, wide, car, tag, road, site, routes):
             return j, base
         way += road[K * k + LONG]
         h += 1
-        k = next_link(i, h, wide, tag, routes)
+        own, k = k, next_link(i, h, wide, tag, routes)
+        if is_beside(own, k, site):
+            break
     return NONE, way
 
 
@@ -548,5 +551,7 @@ def has_room(i, m, sizes, car, tag, road, site, move, routes, driver):
         if way >= needs:
             return True
         h += 1
-        k = next_link(i, h, sizes[WIDE], tag, routes)
+        own, k = k, next_link(i, h, sizes[WIDE], tag, routes)
+        if is_beside(own, k, site):
+            return False
     return True
