@@ -243,9 +243,8 @@ def enter(step, n, sizes, car, tag, road, site, move, routes, rules, driver):
             j, base = site[K * k + TAIL], base - base
         find_gate(i, sizes[WIDE], car, tag, road, site, routes)
         v = min(car[W * i + ASKS], road[K * k + FAST])
-        car[W * i + ENTERING] = (
-            min(v, np.sqrt(2 * rules[MOST_DECEL] * car[W * i + LINE])) if tag[W * i + GATE] >= 0 else v
-        )
+        fast = np.sqrt(2 * rules[MOST_DECEL] * car[W * i + LINE]) if tag[W * i + GATE] >= 0 else v
+        car[W * i + ENTERING] = min(v, fast)
         kind = entry(i, j, base, sizes[EACH], car, driver)
         if kind == SAME:
             continue
