@@ -34,12 +34,12 @@ class _Worlds:
 
     def __init__(self, count: int, choices: dict[str, Any]) -> None:
         kind = KINDS[choices.pop("task", SignalsTask.name)]
-        names = [x.name for x in fields(kind)]
+        names, limit = [x.name for x in fields(kind)], choices.pop("max_episode_steps", None)
         for name in choices:
             if name not in names:
                 like = nearest(str(name), names)
                 raise KeywordError(f"task '{kind.name}' got an unexpected keyword argument {shown(name)}.{like}")
-        if (limit := choices.pop("max_episode_steps", None)) is not None:
+        if limit is not None:
             choices["duration"] = whole("max_episode_steps", limit, 1) * choices.get("hold", kind.hold)
         self.task: Any = kind(**choices)
         self.count = count

@@ -99,11 +99,9 @@ class _Traffic:
             self.state = _restored(self.state, saved.pop("state"))
             frames = saved.pop("frames")
             vars(self).update(saved, frames=[(t, *(x.numpy() for x in arrays)) for t, *arrays in frames])
-        steps, arrived = max(1, round(end / SAMPLE_S)), -1
+        steps, arrived, each = max(1, round(end / SAMPLE_S)), -1, round(SAMPLE_S / self.simulator.dt)
         while self.samples < steps and arrived < len(self.demand.route):
-            self.state, _ = self.simulator.rollout(
-                self.state, {}, self.params, round(SAMPLE_S / self.simulator.dt), keep=None
-            )
+            self.state, _ = self.simulator.rollout(self.state, {}, self.params, each, keep=None)
             self.samples += 1
             time, links = self.samples * SAMPLE_S, junctions.by_link(self.network, self.state)
             self.sums += torch.stack((links.vehicles, links.halting, links.vehicles * links.speed)).double()

@@ -138,7 +138,9 @@ class Ways:
         return {self.network.edge[end]: self.sides[move] for end, _, move in onward}
 
     def draw_route(self, edge: str, shares: Sequence[float], random: np.random.Generator) -> Route:
-        """Return a route from an edge to where no move leads on. ValueError where none seems to do so."""
+        """Return a route from an edge to where no move leads on. ValueError where none is seen, or for shares."""
+        if len(shares) != 3 or not (min(shares) >= 0.0 and 0.0 < sum(shares) < math.inf):
+            raise ValueError(f"shares = {tuple(shares)} must be three numbers from 0 on: left, straight on, right.")
         for _ in range(100):
             edges = [edge]
             while (turns := self._turns(edges[-1])) and len(edges) < MOST_MOVES:
@@ -171,8 +173,6 @@ def draw_turns(
     ways = Ways(network)
     rates = per_hour if isinstance(per_hour, Mapping) else dict.fromkeys(ways.entries, per_hour)
     validation.in_interval("seconds", float(seconds), 0.0, 1e6, "s")
-    if len(shares) != 3 or not (min(shares) >= 0.0 and 0.0 < sum(shares) < math.inf):
-        raise ValueError(f"shares = {tuple(shares)} must be three numbers from 0 on: left, straight on, right.")
     numbers: dict[Route, int] = {}
     route, depart = list[int](), list[float]()
     for edge, rate in rates.items():

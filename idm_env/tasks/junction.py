@@ -100,7 +100,7 @@ class JunctionTask(NetworkTask):
         super().__post_init__()
         if self.agents > self.vehicles:
             raise ValueError(f"agents = {self.agents} must be at most the vehicles, {self.vehicles}.")
-        _ = self.simulator, self.inflows
+        _ = self.simulator, self.inflows, self._demand
 
     # -- static facts ------------------------------------------------------------------------------------------------
 

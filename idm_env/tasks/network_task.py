@@ -84,8 +84,9 @@ class NetworkTask:
         one_of("reward", self.reward, self.rewards)
         for name in {*(self.randomise or {})} - {"inflow"}:
             raise ValueError(f"randomise.{shown(name)} cannot be drawn in task '{self.name}', where inflow can.")
-        if self.trips is not None and (self.randomise or self.inflow != type(self).inflow):
-            raise ValueError(f"trips = {shown(self.trips)} are all who arrive. Leave out inflow and randomise.")
+        usual = (type(self).inflow, type(self).turns)
+        if self.trips is not None and (self.randomise or (self.inflow, self.turns) != usual):
+            raise ValueError(f"trips = {shown(self.trips)} are all who arrive. Leave out inflow, turns and randomise.")
 
     # -- static facts ------------------------------------------------------------------------------------------------
 

@@ -79,7 +79,9 @@ class SignalsTask(NetworkTask):
             raise ValueError(f"amber = {self.amber:g} s must be at most hold = {self.hold:g} s.")
         if not self.agents:
             raise ValueError(f"network = {shown(self.network)} has no signal with two phases. Give one that has.")
-        _ = self.simulator, self.inflows
+        if self.is_closed:
+            raise ValueError(f"network = {shown(self.network)} has no edge to which none leads. Give trips.")
+        _ = self.simulator, self.inflows, self._demand
 
     # -- static facts ------------------------------------------------------------------------------------------------
 
@@ -111,12 +113,10 @@ class SignalsTask(NetworkTask):
         """The network, whose plans have the agents' phases and the ambers between them beside their own."""
         plans = list(self._read[0].plans)
         for s in self.agents:
-            more = tuple(_amber(a, b) for a in self.phases[s] for b in self.phases[s])
-            more = (*self.phases[s], *more)
+            more = (*self.phases[s], *(_amber(a, b) for a in self.phases[s] for b in self.phases[s]))
             # Of no duration: the plan itself never shows them.
-            plans[s] = plans[s]._replace(
-                states=(*plans[s].states, *more), durations=(*plans[s].durations, *[0.0] * len(more))
-            )
+            states, durations = (*plans[s].states, *more), (*plans[s].durations, *[0.0] * len(more))
+            plans[s] = plans[s]._replace(states=states, durations=durations)
         return replace(self._read[0], plans=tuple(plans))
 
     @cached_property
@@ -214,8 +214,7 @@ class SignalsTask(NetworkTask):
     def _outcome(self, first: World, last: World) -> NetworkStep:
         """Return the outcome of a step; a vehicle's lost time counts for the agent before which it was at first."""
         then, now, taken, lost, step = self.tally(first.state, last.state)
-        agents = len(self.agents)
-        before, behind = self._of_link
+        agents, (before, behind) = len(self.agents), self._of_link
         delays = then.sums(lost, before, agents + 1)[:, :agents]
         if self.reward == "unit":
             time = then.sums(taken, before, agents + 1)[:, :agents]

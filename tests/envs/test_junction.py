@@ -141,6 +141,7 @@ def test_faces() -> None:
     """Gymnasium's and PettingZoo's own checks, and an agent a row."""
     check_env(gymnasium.make("DiffIDM/Junction-v0", **SMALL).unwrapped, skip_render_check=True)
     parallel_api_test(parallel_env(task="junction", **SMALL), num_cycles=70)
+    assert parallel_env(task="junction", max_cycles=7).unwrapped.worlds.task.horizon == 7
     env = vector(3, shared=True, duration=2.0)
     assert env.num_envs == 12
     assert env.single_action_space.shape == (1,)
@@ -157,6 +158,7 @@ def test_faces() -> None:
         ({"agents": 0}, "agents = 0"),
         ({"agents": 15, "network": "figure eight"}, "agents = 15 must be at most the vehicles, 14."),
         ({"reward": "wait"}, "reward = 'wait' is unknown."),
+        ({"turns": (0.0, -1.0, 0.0)}, "must be three numbers from 0 on: left, straight on, right."),
         ({"max_command": -1.0}, "max_command = -1 m/s²"),
         ({"randomise": {"agents": [0, 1]}}, "randomise.'agents' cannot be drawn in task 'junction', where inflow can."),
         ({"network": Network.grid(1, 1), "inflow": -1.0}, "inflow = -1 veh/h"),

@@ -203,7 +203,9 @@ def test_faces() -> None:
         ({"randomise": {"turns": [0, 1]}}, "randomise.'turns' cannot be drawn in task 'signals', where inflow can."),
         ({"inflow": -1.0}, "inflow = -1 veh/h"),
         ({"trips": "a.rou.xml", "inflow": 500.0}, "trips = 'a.rou.xml' are all who arrive. Leave out inflow"),
-        ({"trips": "a.rou.xml", "randomise": {"inflow": [1, 2]}}, "are all who arrive. Leave out inflow and"),
+        ({"trips": "a.rou.xml", "randomise": {"inflow": [1, 2]}}, "Leave out inflow, turns and randomise."),
+        ({"trips": "a.rou.xml", "turns": (0.0, 1.0, 0.0)}, "are all who arrive. Leave out"),
+        ({"turns": (0.0, 1.0)}, "must be three numbers from 0 on: left, straight on, right."),
         ({"network": Network.roundabout()}, "has no signal with two phases. Give one that has."),
     ],
 )  # fmt: skip
