@@ -287,10 +287,12 @@ def change(n, sizes, car, tag, road, site, routes, rules, driver):
     some, each = False, sizes[EACH]
     for q in range(n):
         i = tag[W * q + ORDER]
-        k, to = tag[W * i + LINK], next_link(i, tag[W * i + HOP] + 1, sizes[WIDE], tag, routes)
-        v, room, shift = car[W * i + SPEED], car[W * i + LINE] - car[W * i + POSITION], car[W * i + MOVED]
-        if tag[W * i + GATE] != ASIDE or tag[W * i + NEW] >= CAME or shift > 0 or not is_beside(k, to, site):
+        if tag[W * i + GATE] != ASIDE or tag[W * i + NEW] >= CAME or car[W * i + MOVED] > 0:
             continue
+        k, to = tag[W * i + LINK], next_link(i, tag[W * i + HOP] + 1, sizes[WIDE], tag, routes)
+        if not is_beside(k, to, site):
+            continue
+        v, room = car[W * i + SPEED], car[W * i + LINE] - car[W * i + POSITION]
         shift = car[W * i + POSITION] - car[W * i + POSITION] * road[K * to + LONG] / road[K * k + LONG]
         x, p, end = car[W * i + POSITION] - shift, site[K * to + BEGIN], site[K * to + K + BEGIN]
         share = min(1, max(0, room / rules[REACH]))
