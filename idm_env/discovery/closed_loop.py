@@ -13,7 +13,7 @@ import numpy as np
 from idm_env.discovery import judge
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records, whole
-from idm_env.discovery.score import interval_of, left_out, log_gain
+from idm_env.discovery.score import interval_of, log_gain, without
 from idm_env.discovery.solve import Linear, Population, Problem, Solution, finish, linearise, solve
 from idm_env.discovery.units import MANY_RUNS, Units, units
 
@@ -168,7 +168,7 @@ def gains(before: ClosedLoopFit, solution: Solution) -> np.ndarray:
     φ moves by one Newton step where a run is left out, and the errors with it to first order.
     """
     after = evaluate(before.problem.rows.records, solution.model, solution.values, before.problem.prior, solution.theta)
-    change = left_out(before.problem, solution, exact=False)[0]
+    change = without(before.problem, solution)
     rows = before.problem.rows
     by_phi = linearise(replace(after.problem, sigma=1.0), solution.model, after.theta, solution.values).by_phi
     moved = after.errors + np.einsum("rmq,rq->rm", after.across(by_phi), change[rows.run])

@@ -76,10 +76,14 @@ def per_run(problem: Problem, solution: Solution) -> tuple[np.ndarray, np.ndarra
     return gradient, matrix
 
 
-def without(problem: Problem, solution: Solution, part: np.ndarray, parts: int) -> np.ndarray:
-    """Return by how much φ changes [parts, Q] when the runs of a part are left out; ``part`` is that of every run."""
+def without(problem: Problem, solution: Solution, part: np.ndarray | None = None) -> np.ndarray:
+    """Return by how much φ changes [parts, Q] when the runs of a part are left out; ``part`` [runs] is that of each.
+
+    Every run is a part of its own unless it is given.
+    """
+    part = np.arange(len(problem.rows.records.runs)) if part is None else part
     count = len(solution.values)
-    change = np.zeros((parts, count))
+    change = np.zeros((int(part.max()) + 1, count))
     if not count:
         return change
     low, high = (np.array([getattr(p, side) for p in solution.model.parameters]) for side in ("low", "high"))
@@ -103,11 +107,10 @@ def left_out(
     Every run is a part of its own unless ``part`` [runs] says otherwise. In free simulation, and where drivers share θ
     across runs, none is solved; nor is any unless ``exact``.
     """
-    rows, runs = problem.rows, len(problem.rows.records.runs)
-    part = np.arange(runs) if part is None else part
-    change, of_row = without(problem, solution, part, int(part.max()) + 1), part[rows.run]
+    rows, change = problem.rows, without(problem, solution, part)
     if not exact or problem.noise is None or _spans_runs(problem):
         return change, np.zeros(0, int)
+    of_row = rows.run if part is None else part[rows.run]
     moved = np.einsum("rmq,rq->rm", projected(solution), change[of_row])
     size, whole = (np.bincount(of_row, (x**2).sum(-1), len(change)) for x in (moved, solution.linear.residual))
     far = np.flatnonzero(size > LONG**2 * whole)
