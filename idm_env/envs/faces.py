@@ -5,21 +5,18 @@ from typing import Any
 from gymnasium import Env
 from gymnasium.vector import VectorEnv
 
-NETWORKS = ("signals", "junction")
-"""Tasks on networks."""
-
 
 def single(task: Any = None, **keywords: Any) -> Env:
     """Return one environment: a ``DiffIDMEnv``, or a ``NetworkEnv`` for tasks on networks."""
     from idm_env.envs.gym import DiffIDMEnv
-    from idm_env.envs.network_faces import NetworkEnv
+    from idm_env.envs.network_faces import KINDS, NetworkEnv
 
-    return (NetworkEnv if task in NETWORKS else DiffIDMEnv)(task=task, **keywords)
+    return (NetworkEnv if task in KINDS else DiffIDMEnv)(task=task, **keywords)
 
 
 def vector(task: Any = None, **keywords: Any) -> VectorEnv:
     """Return a vector: a ``DiffIDMVectorEnv``, or a ``NetworkVectorEnv`` for tasks on networks."""
-    from idm_env.envs.network_faces import NetworkVectorEnv
+    from idm_env.envs.network_faces import KINDS, NetworkVectorEnv
     from idm_env.envs.vector import DiffIDMVectorEnv
 
-    return (NetworkVectorEnv if task in NETWORKS else DiffIDMVectorEnv)(task=task, **keywords)
+    return (NetworkVectorEnv if task in KINDS else DiffIDMVectorEnv)(task=task, **keywords)

@@ -33,6 +33,14 @@ def street(before: float = 120.0, longer: float = 0.0) -> Network:
     return Network.from_tables(links, moves, [Plan("s", (20.0, 3.0, 17.0), ("GG", "yy", "rr"))])
 
 
+def entered_aside() -> Network:
+    """Return a street of two lanes, of which one comes to a from e, and only b leads on, over y to d."""
+    names = ["a", "b", "y", "d", "e"]
+    links = {"name": names, "length": [100.0] * 5, "limit": [13.89] * 5, "inner": [0, 0, 1, 0, 0]}
+    links |= {"edge": ["in", "in", "y", "out", "before"], "left": ["b", *[None] * 4], "right": [None, "a", *[None] * 3]}
+    return Network.from_tables(links, {"start": ["b", "e"], "end": ["d", "a"], "path": [["y"], []]})
+
+
 def crowded(network: Network, vehicles: int, seed: int, every: float = 2.5) -> Demand:
     """Return vehicles whose ways are drawn, two of three of which cross those of others."""
     route = np.random.default_rng(seed).choice(4, vehicles, p=(0.15, 0.15, 0.35, 0.35))
@@ -105,12 +113,7 @@ def test_routes_take_both_lanes_and_change_where_they_must() -> None:
     ways = Ways(network)
     routes = [ways.route_along(["in", "out"], "test") for _ in range(10)]
     assert {*routes} == {WAYS[0], WAYS[1]} and 4 <= routes.count(WAYS[0]) <= 6
-    moves = {"start": ["b"], "end": ["d"], "path": [["y"]]}
-    names = ["a", "b", "y", "d", "e"]
-    links = {"name": names, "length": [100.0] * 5, "limit": [13.89] * 5, "inner": [0, 0, 1, 0, 0], "edge": names}
-    links |= {"edge": ["in", "in", "y", "out", "before"], "left": ["b", *[None] * 4], "right": [None, "a", *[None] * 3]}
-    moves = {"start": ["b", "e"], "end": ["d", "a"], "path": [["y"], []]}
-    assert Ways(Network.from_tables(links, moves)).route_along(["before", "in", "out"], "test") == (4, 0, 1, 2, 3)
+    assert Ways(entered_aside()).route_along(["before", "in", "out"], "test") == (4, 0, 1, 2, 3)
 
 
 def test_nobody_is_followed_to_the_lane_beside() -> None:
@@ -118,11 +121,7 @@ def test_nobody_is_followed_to_the_lane_beside() -> None:
 
     The way there was counted twice, and kept when the leader came over: they overlapped.
     """
-    names = ["a", "b", "y", "d", "e"]
-    links = {"name": names, "length": [100.0] * 5, "limit": [13.89] * 5, "inner": [0, 0, 1, 0, 0]}
-    links |= {"edge": ["in", "in", "y", "out", "before"], "left": ["b", *[None] * 4], "right": [None, "a", *[None] * 3]}
-    moves = {"start": ["b", "e"], "end": ["d", "a"], "path": [["y"], []]}
-    simulator, params = simulated(Network.from_tables(links, moves))
+    simulator, params = simulated(entered_aside())
     demand = Demand(padded([(4, 0, 1, 2, 3), (1, 2, 3)]), np.arange(2), np.zeros(2))
     state = travelling(simulator, demand, params, hop=[0, 0], position=[95.0, 30.0])
     state, _ = simulator.rollout(state, {}, params, 1, keep=None)
