@@ -22,7 +22,8 @@ _LAZY = {
 
 _LANES_TASKS = ("highway", "open_highway", "merge", "bottleneck", "replay_lanes", "approach")
 _TASKS = ("follow", "platoon", "replay", "ring", *_LANES_TASKS)
-"""The keys of ``idm_env.tasks.TASKS``, which needs torch."""
+_ON_NETWORKS = ("signals", "junction")
+"""The keys of ``idm_env.tasks.TASKS`` and its ``ON_NETWORKS``, which need torch."""
 
 __all__ = ["__version__", *(name for names in _LAZY.values() for name in names)]
 
@@ -43,7 +44,7 @@ def _register() -> None:
     """Register the environment ids; entry points are text, so that nothing heavy is imported here."""
     from gymnasium.envs.registration import register, registry
 
-    tasks = {_task_id(t): {"task": t} for t in (*_TASKS, "signals", "junction")}
+    tasks = {_task_id(t): {"task": t} for t in (*_TASKS, *_ON_NETWORKS)}
     for name, keywords in {"DiffIDM-v0": {}, **tasks}.items():
         if name not in registry:
             register(

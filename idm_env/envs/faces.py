@@ -9,14 +9,14 @@ from gymnasium.vector import VectorEnv
 def single(task: Any = None, **keywords: Any) -> Env:
     """Return one environment: a ``DiffIDMEnv``, or a ``NetworkEnv`` for tasks on networks."""
     from idm_env.envs.gym import DiffIDMEnv
-    from idm_env.envs.network_faces import KINDS, NetworkEnv
+    from idm_env.envs.network_faces import NetworkEnv, is_on_network
 
-    return (NetworkEnv if task in KINDS else DiffIDMEnv)(task=task, **keywords)
+    return (NetworkEnv if is_on_network(task) else DiffIDMEnv)(task=task, **keywords)
 
 
 def vector(task: Any = None, **keywords: Any) -> VectorEnv:
     """Return a vector: a ``DiffIDMVectorEnv``, or a ``NetworkVectorEnv`` for tasks on networks."""
-    from idm_env.envs.network_faces import KINDS, NetworkVectorEnv
+    from idm_env.envs.network_faces import NetworkVectorEnv, is_on_network
     from idm_env.envs.vector import DiffIDMVectorEnv
 
-    return (NetworkVectorEnv if task in KINDS else DiffIDMVectorEnv)(task=task, **keywords)
+    return (NetworkVectorEnv if is_on_network(task) else DiffIDMVectorEnv)(task=task, **keywords)

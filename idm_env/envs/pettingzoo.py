@@ -25,7 +25,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 from idm_env.envs.batch import Batch, Outcome
 from idm_env.envs.gym import Pictures
 from idm_env.envs.info import ids
-from idm_env.envs.network_faces import KINDS, network_parallel_env
+from idm_env.envs.network_faces import is_on_network, network_parallel_env
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, numpy_dtype, observation_box
 from idm_env.validation import shown, whole
@@ -60,7 +60,7 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
 
     def __new__(cls, **keywords: Any) -> Any:
         """Return the environment of a task: of ``signals`` and ``junction`` that of networks."""
-        if keywords.get("task") in KINDS:
+        if is_on_network(keywords.get("task")):
             return network_parallel_env(**keywords)
         return super().__new__(cls)
 

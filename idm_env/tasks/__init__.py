@@ -27,6 +27,8 @@ from idm_env.validation import nearest, shown
 _TASKS: list[type[Task]] = [RingTask, FollowTask, PlatoonTask, ReplayTask, ReplayLanesTask, HighwayTask]
 _TASKS += [OpenHighwayTask, MergeTask, BottleneckTask, ApproachTask]
 TASKS = {task.name: task for task in _TASKS}
+ON_NETWORKS = ("signals", "junction")
+"""Tasks that only environments of networks make."""
 
 
 def make_task(task: str = "ring", *, trusted: bool = False, **choices: Any) -> Task:
@@ -45,8 +47,10 @@ def task_with(task: str, choices: Mapping[str, Any], others: Iterable[str] = ())
 
     ValueError for an unknown task, KeywordError for an unknown keyword.
     """
+    if isinstance(task, str) and task in ON_NETWORKS:
+        raise ValueError(f"task '{task}' stands on a network, which only Gymnasium and PettingZoo make. Use gym.make.")
     if not isinstance(task, str) or task not in TASKS:
-        raise ValueError(f"unknown task {shown(task)}.{nearest(shown(task), TASKS)}")
+        raise ValueError(f"unknown task {shown(task)}.{nearest(shown(task), [*TASKS, *ON_NETWORKS])}")
     names = [f.name for f in dataclasses.fields(TASKS[task]) if f.init]
     for choice in choices:
         if choice not in names:
