@@ -155,12 +155,9 @@ class Network(Road):
         columns |= {k: [place("link", rows, x) for x in links[k]] for k in ("left", "right") if k in links}
         columns |= {k: [place("link", rows, x) for x in moves[k]] for k in ("start", "end")}
         columns |= {k: padded(moves[k]) for k in ("foes", "yields") if k in moves}
-        if "path" in moves:
-            columns["path"] = padded([[place("link", rows, x) for x in row] for row in moves["path"]])
-        if "signal" in moves:
-            columns["signal"] = [place("signal", signals, x) for x in moves["signal"]]
-        if "index" in moves:
-            columns["index"] = [NONE if x is None else x for x in moves["index"]]
+        columns["path"] = padded([[place("link", rows, x) for x in row] for row in moves.get("path", [[]])])
+        columns["signal"] = [place("signal", signals, x) for x in moves.get("signal", [None])]
+        columns["index"] = [NONE if x is None else x for x in moves.get("index", [None])]
         return cls(names, plans=tuple(plans), **columns)
 
     @classmethod
@@ -345,9 +342,7 @@ def _check_moves(net: Network) -> None:
         if min(net.start[m], net.end[m]) < 0 or net.inner[net.start[m]] or net.inner[net.end[m]]:
             raise ValueError(f"{who}: must begin and end on links that are not inside a junction.")
         for k in way[(net.move_of[way] != m) | ~net.inner[way]]:
-            raise ValueError(
-                f"{who}: link '{net.names[k]}' of its path must be inside a junction, and of one move only."
-            )
+            raise ValueError(f"{who}: link '{net.names[k]}' of its path must be inside a junction, and of this move.")
         for f in net.foes[m][net.foes[m] >= 0]:
             if f == m or m not in net.foes[f]:
                 raise ValueError(f"{who}: its foe {net.move_name(f)} must be another move, and have it as a foe.")

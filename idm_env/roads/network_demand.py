@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from idm_env.roads.network import Array, Network
+from idm_env.roads.network import NONE, Array, Network
 from idm_env.roads.sumo_demand import read_demand
 from idm_env.roads.ways import draw_turns
 from idm_env.validation import shown
@@ -50,9 +50,7 @@ class Demand:
                 raise ValueError(f"vehicle {i}: {name} = {columns[name][i]} does not exist; there are {count}.")
         for name, low, high in (("depart", 0.0, np.inf), ("speed", 0.0, 1e3), ("length", 0.1, 100.0)):
             for i in np.flatnonzero(~((columns[name] >= low) & (columns[name] <= high))):
-                raise ValueError(
-                    f"vehicle {i}: {name} = {columns[name][i]:g} must be at least {low:g}, at most {high:g}."
-                )
+                raise ValueError(f"vehicle {i}: {name} = {columns[name][i]:g} must be from {low:g} to {high:g}.")
 
     @classmethod
     def from_sumo(cls, network: Network, *paths: str | Path, seed: int = 0, end: float = 3600.0) -> Demand:
@@ -61,7 +59,7 @@ class Demand:
         Flows without an end last until ``end`` (s); ``skipped`` counts what was left out or changed. ValueError, in one
         line that names the element, for a file that cannot be used.
         """
-        return cls(**read_demand(network, [Path(path) for path in paths], seed, end))._checked(network)
+        return cls(**read_demand(network, [Path(path) for path in paths], seed, end)).check(network)
 
     @classmethod
     def by_turns(
@@ -75,17 +73,14 @@ class Demand:
     ) -> Demand:
         """Return Poisson arrivals at every edge to which none leads, which turn left, go on or turn right by shares.
 
-        ``per_hour`` is one rate for all, or one by edge (1/h); a journey ends where no edge follows. The same seed
-        gives the same demand. ValueError for a rate, a share or an edge that cannot be.
+        ``per_hour`` is one rate for all, or one by edge (1/h); a journey ends where no edge follows. Nobody turns back,
+        and an edge to which one can only turn back is one to which none leads. The same seed gives the same demand.
+        ValueError for a rate, a share or an edge that cannot be.
         """
-        return cls(**draw_turns(network, per_hour, seconds, seed, shares))._checked(network)
+        return cls(**draw_turns(without_turns_back(network), per_hour, seconds, seed, shares)).check(network)
 
-    def _checked(self, network: Network) -> Demand:
-        self.check(network)
-        return self
-
-    def check(self, network: Network) -> None:
-        """Raise ValueError, in one line, for a route that does not connect, or a move in use that is never green."""
+    def check(self, network: Network) -> Demand:
+        """Return this demand. ValueError, in one line, for a route that does not connect, or moves never green."""
         links = len(network.names)
         pairs = network.follows[:, 0] * links + network.follows[:, 1]
         for r in np.unique(self.route):
@@ -104,3 +99,14 @@ class Demand:
                 if not network.ever_open(int(m)):
                     signal = network.plans[network.signal[m]].name
                     raise ValueError(f"route {r}: signal '{signal}' never shows green to move {network.move_name(m)}.")
+        return self
+
+
+def without_turns_back(network: Network) -> Network:
+    """Return the network less the moves that turn by more than 170°, such as those at the dead ends of netgenerate."""
+    pieces = [shape if len(shape) > 1 else np.zeros((2, 2)) for shape in network.shape or [()] * len(network.names)]
+    first, last = (np.array([x[i + 1] - x[i] for x in pieces]) @ (1.0, 1.0j) for i in (0, -2))
+    stays = np.abs(np.angle(first[network.end] * last[network.start].conj(), deg=True)) <= 170.0
+    rows = np.append(np.where(stays, np.cumsum(stays) - 1, NONE), NONE)
+    columns = {name: getattr(network, name)[stays] for name in ("start", "end", "path", "signal", "index")}
+    return replace(network, **columns, **{name: rows[getattr(network, name)[stays]] for name in ("foes", "yields")})

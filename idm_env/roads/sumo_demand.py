@@ -94,9 +94,7 @@ class _Reader:
             keys = element.get(f"{kind}s", "").split()
             weights = element.get("probabilities", "1 " * len(keys)).split()
             if len(keys) != len(weights):
-                raise ValueError(
-                    f"{name(element)} has {len(keys)} names and {len(weights)} probabilities. Give one each."
-                )
+                raise ValueError(f"{name(element)}: {len(weights)} probabilities for {len(keys)} names. Give one each.")
             pairs = [(float(w), self._named(kind, key, element)[0][1]) for key, w in zip(keys, weights, strict=True)]
             pairs += [pair for each in element.iter(kind) for pair in self._choices(each, kind, owner)]
         if not sum(weight for weight, _ in pairs) > 0.0:
@@ -108,9 +106,8 @@ class _Reader:
     def _named(self, kind: str, key: str, element: Element) -> list[tuple[float, Any]]:
         """Return the types or routes of a name; ValueError where there are none."""
         if key not in self.known[kind]:
-            raise ValueError(
-                f"{name(element)}: {kind} '{key[:60]}' is unknown.{validation.nearest(key, self.known[kind])}"
-            )
+            near = validation.nearest(key, self.known[kind])
+            raise ValueError(f"{name(element)}: {kind} '{key[:60]}' is unknown.{near}")
         return self.known[kind][key]
 
     def _route_of(self, element: Element, owner: str) -> Route:

@@ -18,7 +18,7 @@ import torch
 from idm_env.effects import IDM, Brakes, Effect, LinkLimit, StopLine
 from idm_env.multilane.junctions import HALTING, NEVER, journeys_of, of_kinds, travelling
 from idm_env.roads.network import Array, Network, padded
-from idm_env.roads.network_demand import Demand
+from idm_env.roads.network_demand import Demand, without_turns_back
 from idm_env.roads.ways import Ways, keyed
 from idm_env.simulator import Simulator
 from idm_env.tasks.behaviour import Behaviour, behaviour
@@ -152,7 +152,7 @@ class NetworkTask:
 
     @cached_property
     def _ways(self) -> Ways:
-        return Ways(self.road)
+        return Ways(without_turns_back(self.road))
 
     @property
     def is_closed(self) -> bool:

@@ -80,7 +80,7 @@ class SignalsTask(NetworkTask):
         if not self.agents:
             raise ValueError(f"network = {shown(self.network)} has no signal with two phases. Give one that has.")
         if self.is_closed:
-            raise ValueError(f"network = {shown(self.network)} has no edge to which none leads. Give trips.")
+            raise ValueError(f"network = {shown(self.network)} has no open end: others lead to each edge. Give trips.")
         _ = self.simulator, self.inflows, self._demand
 
     # -- static facts ------------------------------------------------------------------------------------------------

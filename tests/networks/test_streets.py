@@ -9,9 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from idm_env.roads import streets
 from idm_env.roads.network import Network
 from idm_env.roads.network_demand import Demand
 from idm_env.roads.ways import Ways
+from idm_env.tasks.junction import JunctionTask
+from idm_env.tasks.network_task import NetworkTask
+from idm_env.tasks.signals import SignalsTask
 
 MANY = [
     Network.grid(2, 3), Network.grid(2, 2, control="priority"), Network.crossing(control="right_before_left"),
@@ -87,6 +91,23 @@ def test_turns_have_their_shares_and_arrivals_their_rate() -> None:
     again = Demand.by_turns(network, {**rates, "left1A1": 60.0}, 7200.0, seed=4, shares=(0.1, 0.7, 0.2))
     first = [network.edge[again.routes[r][0]] for r in again.route]
     np.testing.assert_array_equal(again.depart[np.array(first) != "left1A1"], demand.depart)
+
+
+def test_who_turns_by_chance_does_not_turn_back() -> None:
+    """Dead ends at which one can turn, as netgenerate's, bring the same vehicles as open ends."""
+    plain, turning = (streets.grid(2, 2, 200.0, 150.0, 13.89, "signals") for _ in range(2))
+    for away in [name for name in turning.roads if name.endswith(("left0", "left1", "right0", "right1", "top0"))]:
+        turning.join(away[2:], {(away, away[2:] + away[:2]): (0, 0)})
+    open_ends, dead_ends = (Network._from_plain(each.tables()) for each in (plain, turning))
+    assert len(dead_ends.start) == len(open_ends.start) + 5
+    demands = [Demand.by_turns(network, 600.0, 600.0) for network in (open_ends, dead_ends)]
+    ways = [[[network.names[k] for k in demand.routes[r] if k >= 0] for r in demand.route]
+            for network, demand in zip((open_ends, dead_ends), demands, strict=True)]  # fmt: skip
+    assert ways[0] == ways[1] and len(ways[0]) > 300
+    kinds: list[type[NetworkTask]] = [SignalsTask, JunctionTask]
+    for kind in kinds:
+        counts = [kind(network=network, duration=60.0).vehicles for network in (open_ends, dead_ends)]
+        assert counts[0] == counts[1]
 
 
 @pytest.mark.parametrize("kind", ["priority", "right_before_left", "traffic_light"])

@@ -157,7 +157,7 @@ def test_what_is_not_traffic_of_cars_is_counted(tmp_path: Path) -> None:
         ('<flow id="f" from="left0A0" to="A0B0"/>', '<flow id="f"> has neither a number nor a rate'),
         ('<flow id="f" from="left0A0" to="A0B0" period="1e-9"/>', '<flow id="f"> brings more than 5000000 vehicles'),
         ('<flow id="f" from="left0A0" to="A0B0" period="exp(x)"/>', "<flow id=\"f\">: period = 'x' must be a number"),
-        ('<vTypeDistribution id="d" vTypes="a b" probabilities="1"/>', "has 2 names and 1 probabilities"),
+        ('<vTypeDistribution id="d" vTypes="a b" probabilities="1"/>', "1 probabilities for 2 names"),
         ('<routeDistribution id="d"/>', '<routeDistribution id="d"> has nothing of a probability above 0'),
     ],
 )  # fmt: skip

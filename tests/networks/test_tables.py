@@ -52,8 +52,8 @@ def test_bad_tables_name_their_element(links: Any, moves: Any, plans: Any, text:
         ({"routes": [[0, 1, -1]]}, r"route 0: must begin and end outside junctions"),
         ({"routes": [[0, 9, 2]]}, r"must be links from 0 to 4"),
         ({"route": [1]}, r"vehicle 0: route = 1 does not exist"),
-        ({"depart": [-1.0]}, r"vehicle 0: depart = -1 must be at least 0"),
-        ({"length": [0.0]}, r"vehicle 0: length = 0 must be at least 0\.1"),
+        ({"depart": [-1.0]}, r"vehicle 0: depart = -1 must be from 0 to inf"),
+        ({"length": [0.0]}, r"vehicle 0: length = 0 must be from 0\.1 to 100"),
         ({"kind": [1]}, r"vehicle 0: kind = 1 does not exist"),
     ],
 )
