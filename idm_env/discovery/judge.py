@@ -66,13 +66,12 @@ class Judged:
         of_row = self.follower[self.rows.record]
         samples = self._summed(of_row, self.rows.valid.sum(1))
         of_window = self.follower[self.ahead_record]
+        horizon = self._summed(of_window, self.ahead**2), self._summed(of_window, np.ones(len(of_window)))
         return {
             "gap_rmse_m": (self._summed(of_row, (self.gap_error**2).sum(1)), samples),
-            "horizon_rmse_m": (
-                self._summed(of_window, self.ahead**2), self._summed(of_window, np.ones(len(of_window))),
-            ),
+            "horizon_rmse_m": horizon,
             "speed_rmse_mps": (self._summed(of_row, (speed_error**2).sum(1)), samples),
-        }  # fmt: skip
+        }
 
     def _summed(self, follower: np.ndarray, values: np.ndarray) -> np.ndarray:
         return np.bincount(follower, values, minlength=len(self.followers)).astype(float)

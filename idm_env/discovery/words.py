@@ -310,10 +310,8 @@ def details(found: Sequence[TermFinding], nearest: Sequence[TermFinding]) -> lis
 
 def cautions(at_bounds: Mapping[str, int], groups: int) -> list[str]:
     """Say what else speaks against the figures: parameters at their bounds."""
-    return [
-        f"The fitted {name.replace('_', ' ')} is at its bound for {n} of {groups} groups of drivers."
-        for name, n in at_bounds.items() if n > 0.2 * groups
-    ]  # fmt: skip
+    often = {name.replace("_", " "): n for name, n in at_bounds.items() if n > 0.2 * groups}
+    return [f"The fitted {name} is at its bound for {n} of {groups} groups of drivers." for name, n in often.items()]
 
 
 def agreement(ladder: Ladder | None, leading: Term | None) -> list[str]:

@@ -6,7 +6,6 @@ All worlds begin and end together: an episode has as many steps in each of them,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Any
 
 import gymnasium
@@ -18,12 +17,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from pettingzoo import ParallelEnv
 
-from idm_env.tasks import KeywordError
+from idm_env.envs.settings import reset_options
+from idm_env.tasks import with_keywords
+from idm_env.tasks.checks import by_name
 from idm_env.tasks.junction import JunctionTask
-from idm_env.tasks.network_task import NetworkStep
+from idm_env.tasks.network_task import NetworkStep, NetworkTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.signals import SignalsTask
-from idm_env.validation import nearest, shown, whole
+from idm_env.validation import shown, whole
 
 KINDS: dict[str, type[SignalsTask] | type[JunctionTask]] = {x.name: x for x in (SignalsTask, JunctionTask)}
 """Tasks on networks by name."""
@@ -39,14 +40,10 @@ class _Worlds:
 
     def __init__(self, count: int, choices: dict[str, Any]) -> None:
         kind = KINDS[choices.pop("task", SignalsTask.name)]
-        names, limit = [x.name for x in fields(kind)], choices.pop("max_episode_steps", None)
-        for name in choices:
-            if name not in names:
-                like = nearest(str(name), names)
-                raise KeywordError(f"task '{kind.name}' got an unexpected keyword argument {shown(name)}.{like}")
-        if limit is not None:
-            choices["duration"] = whole("max_episode_steps", limit, 1) * choices.get("hold", kind.hold)
-        self.task: Any = kind(**choices)
+        if (limit := choices.pop("max_episode_steps", None)) is not None:
+            NetworkTask.ranges["hold"].check("hold", hold := choices.get("hold", kind.hold))
+            choices["duration"] = whole("max_episode_steps", limit, 1, round(86_400 / hold)) * hold
+        self.task: Any = with_keywords(kind.name, kind, choices)
         self.count = count
         self.seeds, self.episodes = np.zeros(count, np.int64), np.full(count, -1)
         self.world: Any = None
@@ -56,25 +53,26 @@ class _Worlds:
         """Begin anew with the first episodes of these seeds."""
         self.seeds, self.episodes = np.array([s % (1 << 63) for s in seeds], np.int64), np.full(self.count, -1)
 
-    def begin(self) -> np.ndarray:
-        """Begin the next episode in all worlds; return observations ``[B, S, F]``."""
+    def begin(self, options: Any = None) -> np.ndarray:
+        """Begin the next episode in all worlds; return observations ``[B, S, F]``. ValueError for options."""
+        reset_options(options, ())
         self.episodes += 1
         self.done = 0
         draw = Draw.of(torch.from_numpy(self.seeds), torch.from_numpy(self.episodes))
         self.world = self.task.begin(draw)
         return self.task.observe(self.world)
 
-    def step(self, actions: Any) -> tuple[np.ndarray, NetworkStep, bool]:
+    def step(self, actions: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, NetworkStep, bool]:
         """Do a step; return observations ``[B, S, F]``, the outcome, and whether the episodes are over.
 
-        RuntimeError before ``begin``; ValueError for actions (B, S) that cannot be.
+        RuntimeError before ``begin``; ValueError for actions that cannot be, or are not of this shape.
         """
         if self.world is None:
             raise RuntimeError("step was called before reset. Call reset() first.")
         if self.done >= self.task.horizon:
             raise RuntimeError("the episodes are over. Call reset() first.")
         if actions is not None:
-            actions = self.task.check_actions(np.asarray(actions), (self.count, len(self.task.names)))
+            actions = self.task.check_actions(actions, shape).reshape(self.count, -1)
         self.world, outcome = self.task.step(self.world, actions)
         self.done += 1
         return self.task.observe(self.world), outcome, self.done == self.task.horizon
@@ -109,6 +107,8 @@ class NetworkVectorEnv(VectorEnv):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
 
     def __init__(self, num_envs: int = 1, shared: bool = False, **choices: Any) -> None:
+        if not isinstance(shared, bool):
+            raise ValueError(f"shared = {shown(shared)} must be True or False.")
         self.worlds = _Worlds(whole("num_envs", num_envs, 1), choices)
         self.task, agents = self.worlds.task, len(self.worlds.task.names)
         self._shared, self._each = shared, agents if shared else 1
@@ -127,18 +127,22 @@ class NetworkVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin episodes in all worlds, with a seed s the first of s + i in world i; return observations ``[n, F]``."""
+        """Begin episodes in all worlds, with a seed s the first of s + i in world i; return observations ``[n, F]``.
+
+        Of seeds in a sequence, one for each row, the first ones are those of worlds. ValueError for any others.
+        """
         if isinstance(seed, Sequence):
-            seed = next((s for s in seed if s is not None), None)
-        if seed is not None or self.worlds.world is None:
+            if len(seed) != self.num_envs:
+                raise ValueError(f"seed = {shown(seed)} must be a number, or one for each of {self.num_envs} rows.")
+            self.worlds.seed([whole("seed", s, 0) for s in seed[: self.worlds.count]])
+        elif seed is not None or self.worlds.world is None:
             super().reset(seed=None if seed is None else whole("seed", seed, 0))
             self.worlds.seed([int(self.np_random_seed or 0) + i for i in range(self.worlds.count)])
-        return self._rows(self.worlds.begin()), {}
+        return self._rows(self.worlds.begin(options)), {}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all worlds by ``hold`` seconds with actions ``[n]`` or ``[n, S]``; ValueError for what is none."""
-        chosen = None if actions is None else np.asarray(actions).reshape(self.worlds.count, -1)
-        seen, outcome, over = self.worlds.step(chosen)
+        seen, outcome, over = self.worlds.step(actions, self.action_space.shape or ())
         reward = outcome.reward.reshape(-1) if self._shared else outcome.reward.mean(1)
         rows = self._rows(seen)
         info: dict[str, Any] = {name: np.repeat(x, self._each) for name, x in _info(outcome).items()}
@@ -166,11 +170,11 @@ class NetworkEnv(gymnasium.Env):
         super().reset(seed=None if seed is None else whole("seed", seed, 0))
         if seed is not None or self.worlds.world is None:
             self.worlds.seed([self.np_random_seed])
-        return self.worlds.begin().reshape(-1), {}
+        return self.worlds.begin(options).reshape(-1), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance by ``hold`` seconds with actions ``[S]``; None for no agents."""
-        seen, outcome, over = self.worlds.step(None if action is None else np.asarray(action)[None])
+        seen, outcome, over = self.worlds.step(action, self.action_space.shape or ())
         info = {name: x[0].item() for name, x in _info(outcome).items()}
         return seen.reshape(-1), float(outcome.reward.mean(1)[0]), False, over, info
 
@@ -213,16 +217,17 @@ class network_parallel_env(ParallelEnv[str, np.ndarray, Any]):  # noqa: N801  (a
     def step(self, actions: dict[str, Any] | None) -> tuple[Any, Any, Any, Any, Any]:
         """Advance by ``hold`` seconds with an action of every agent; None in place of all of them.
 
-        ValueError for an agent without an action.
+        ValueError for an agent without an action, or with several.
         """
         if not self.agents:
             return {}, {}, {}, {}, {}
         if actions is not None:
+            by_agent = by_name("actions", actions)
             for agent in self.agents:
-                if agent not in actions:
+                if np.size(by_agent.get(agent, ())) != 1:
                     raise ValueError(f"there is no action for agent '{agent}'. Give one for each of env.agents.")
-        chosen = None if actions is None else np.array([[np.asarray(actions[a]).item() for a in self.agents]])
-        seen, outcome, over = self.worlds.step(chosen)
+        chosen = None if actions is None else [np.asarray(by_agent[agent]).item() for agent in self.agents]
+        seen, outcome, over = self.worlds.step(chosen, (len(self.agents),))
         infos = {agent: {name: x[0].item() for name, x in _info(outcome).items()} for agent in self.agents}
         ends = dict.fromkeys(self.agents, over)
         self.agents = [] if over else self.agents

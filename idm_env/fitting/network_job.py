@@ -20,6 +20,7 @@ from idm_env.reports.diagrams import COLOURS
 from idm_env.roads.network import Network
 from idm_env.roads.network_demand import Demand
 from idm_env.simulator import Simulator
+from idm_env.types import mapped
 
 TABLES = ("links", "trips", "over_time")
 WRITTEN = ("report.json", "report.html", "map.png", "animation.gif", *(f"{name}.csv" for name in TABLES))
@@ -31,20 +32,14 @@ FRAMES = 120
 """Pictures of an animation at most."""
 COUNTS = ("time_s", "due", "inside", "arrived", "queued", "halting", "mean_speed_mps")
 
-Frame = tuple[float, np.ndarray, np.ndarray, np.ndarray]
+Frame = tuple[float, torch.Tensor, torch.Tensor, torch.Tensor]
 """A time (s), and of vehicles then on the network links, positions (m) and speeds (m/s), ``[vehicles]`` each."""
 
 
 def simulate_network(
-    net: Path,
-    routes: Sequence[Path],
-    out: Path,
-    *,
-    seconds: float | None = None,
-    seed: int = 0,
-    resume: bool = False,
+    net: Path, routes: Sequence[Path], out: Path, *, seconds: float | None = None, seed: int = 0, resume: bool = False,
     on_progress: OnProgress = silent,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Return the report of traffic on a network for ``seconds`` (s), by default until all have arrived; write it.
 
     ``resume`` goes on with an interrupted run. ValueError, in one line, for files that cannot be used.
@@ -96,9 +91,9 @@ class _Traffic:
     def run(self, end: float, store: storage.Store, progress: OnProgress) -> None:
         """Simulate until ``end`` (s), or until all have arrived."""
         if (saved := store.get("state")) is not None:
-            self.state = _restored(self.state, saved.pop("state"))
-            frames = saved.pop("frames")
-            vars(self).update(saved, frames=[(t, *(x.numpy() for x in arrays)) for t, *arrays in frames])
+            leaves = iter(saved.pop("state"))
+            self.state = mapped(lambda _: next(leaves), self.state)
+            vars(self).update(saved)
         steps, arrived, each = max(1, round(end / SAMPLE_S)), -1, round(SAMPLE_S / self.simulator.dt)
         while self.samples < steps and arrived < len(self.demand.route):
             self.state, _ = self.simulator.rollout(self.state, {}, self.params, each, keep=None)
@@ -112,18 +107,18 @@ class _Traffic:
             self._add_frame(time)
             progress("simulating", self.samples, steps, f"{time:.0f} s, {inside} inside, {arrived} arrived")
             if time % KEPT_S == 0:
-                names = ("sums", "samples", "stride", "periods")
-                content = {name: getattr(self, name) for name in names} | {"state": _plain(self.state)}
-                frames = [[t, *map(torch.from_numpy, arrays)] for t, *arrays in self.frames]
-                store.put("state", content | {"frames": frames})
+                content = {name: getattr(self, name) for name in ("sums", "samples", "stride", "periods", "frames")}
+                leaves = list[torch.Tensor]()
+                mapped(leaves.append, self.state)  # type: ignore[arg-type]
+                store.put("state", content | {"state": leaves})
 
     def _add_frame(self, time: float) -> None:
         """Keep where everybody is; of too many frames every other one goes."""
         assert self.state.lanes is not None and self.state.present is not None
         here = self.state.present > 0
         if self.samples % self.stride == 0:
-            arrays = (x[here].numpy() for x in (self.state.lanes.lane, self.state.position, self.state.speed))
-            self.frames.append((time, *arrays))  # type: ignore[arg-type]
+            links, positions, speeds = (x[here] for x in (self.state.lanes.lane, self.state.position, self.state.speed))
+            self.frames.append((time, links, positions, speeds))
         if len(self.frames) > FRAMES:
             self.frames, self.stride = self.frames[1::2], 2 * self.stride
 
@@ -159,18 +154,6 @@ class _Traffic:
             sentence += f", after {mean:.1f} s on average; at the limits their routes take {free:.1f} s"
         skipped = {**self.network.skipped, **self.demand.skipped}
         return {"sentence": f"{sentence}.", **numbers, "skipped": skipped, "cautions": self.network.cautions()}
-
-
-def _plain(value: Any) -> Any:
-    """Return named tuples as mappings, as a store can keep them."""
-    return {key: _plain(x) for key, x in value._asdict().items()} if hasattr(value, "_asdict") else value
-
-
-def _restored(like: Any, saved: Any) -> Any:
-    """Return named tuples of the kind of ``like`` from mappings."""
-    if not hasattr(like, "_replace"):
-        return saved
-    return like._replace(**{key: _restored(getattr(like, key), x) for key, x in saved.items()})
 
 
 def _empty_map(network: Network) -> tuple[Any, Any, Any]:
@@ -220,7 +203,7 @@ def animate(network: Network, frames: Sequence[Frame]) -> Any:
     def picture(frame: Frame) -> tuple[Any]:
         time, links, positions, speeds = frame
         points = [_point(network, k, x) for k, x in zip(links.tolist(), positions.tolist(), strict=True)]
-        dots.set(offsets=np.reshape(points, (-1, 2)), array=speeds)
+        dots.set(offsets=np.reshape(points, (-1, 2)), array=speeds.numpy())
         axes.set_title(f"{time:.0f} s", fontsize=10)
         return (dots,)
 

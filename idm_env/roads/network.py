@@ -171,17 +171,9 @@ class Network(Road):
 
     @classmethod
     def grid(
-        cls,
-        rows: int,
-        columns: int,
-        *,
-        block: float = 200.0,
-        arm: float = 200.0,
-        limit: float = 13.89,
-        control: str = "signals",
-        green: float = 42.0,
-        amber: float = 3.0,
-    ) -> Network:
+        cls, rows: int, columns: int, *, block: float = 200.0, arm: float = 200.0, limit: float = 13.89,
+        control: str = "signals", green: float = 42.0, amber: float = 3.0,
+    ) -> Network:  # fmt: skip
         """Return so many crossings, ``block`` m apart, around them arms of ``arm`` m; names are netgenerate's.
 
         ``control`` is signals, priority (streets from south to north), right_before_left or none. ValueError for
@@ -264,9 +256,8 @@ class Network(Road):
         after = {m: set(self.yields[m].tolist()) & set(free) for m in free}
         lines = []
         for circle in _circles(after):
-            lines.append(
-                f"moves {', '.join(map(self.move_name, circle))} yield in a circle, and may block one another."
-            )
+            names = ", ".join(map(self.move_name, circle))
+            lines.append(f"moves {names} yield in a circle, and may block one another.")
         for m in free:
             for f in self.foes[m].tolist():
                 if f > m and f in after and f not in after[m] and m not in after[f] and self.start[f] != self.start[m]:
@@ -366,18 +357,15 @@ def _check_plans(net: Network) -> None:
         if not plan.states or len(plan.states) != len(plan.durations):
             raise ValueError(f"{who}: {len(plan.durations)} durations for {len(plan.states)} states.")
         if not (all(0.0 <= d < np.inf for d in plan.durations) and any(plan.durations) and np.isfinite(plan.offset)):
-            raise ValueError(
-                f"{who}: durations {shown(plan.durations)} s must be numbers from 0 on, not all 0, its offset a number."
-            )
+            rule = "must be numbers from 0 on, not all 0, its offset a number"
+            raise ValueError(f"{who}: durations {shown(plan.durations)} s {rule}.")
         if wrong := set("".join(plan.states)) - set(LETTERS):
             raise ValueError(f"{who}: letter '{min(wrong)}' of a state is unknown. Known: {' '.join(LETTERS)}.")
         mine = np.flatnonzero(net.signal == s)
         for state in plan.states:
             for m in mine[(net.index[mine] < 0) | (net.index[mine] >= len(state))]:
-                raise ValueError(
-                    f"{who}: state {shown(state)} has {len(state)} letters, and move {net.move_name(m)} "
-                    f"is shown number {net.index[m]}, from 0 on."
-                )
+                shows = f"move {net.move_name(m)} is shown number {net.index[m]}, from 0 on"
+                raise ValueError(f"{who}: state {shown(state)} has {len(state)} letters, and {shows}.")
 
 
 def _circles(after: Mapping[int, set[int]]) -> list[list[int]]:

@@ -63,14 +63,9 @@ class Demand:
 
     @classmethod
     def by_turns(
-        cls,
-        network: Network,
-        per_hour: float | Mapping[str, float],
-        seconds: float,
-        *,
-        seed: int = 0,
+        cls, network: Network, per_hour: float | Mapping[str, float], seconds: float, *, seed: int = 0,
         shares: Sequence[float] = (0.2, 0.6, 0.2),
-    ) -> Demand:
+    ) -> Demand:  # fmt: skip
         """Return Poisson arrivals at every edge to which none leads, which turn left, go on or turn right by shares.
 
         ``per_hour`` is one rate for all, or one by edge (1/h); a journey ends where no edge follows. Nobody turns back,

@@ -1,6 +1,7 @@
 """Elements of SUMO's XML files, one at a time, with errors that name the element in one line."""
 
 import gzip
+import os
 import re
 import zlib
 from collections.abc import Iterator
@@ -16,8 +17,8 @@ def elements(path: Path, roots: tuple[str, ...]) -> Iterator[Element]:
 
     ValueError for a file that is missing, is no XML, or has another root.
     """
-    if not path.is_file():
-        raise ValueError(f"{path} is no file. Give the path of an XML file of SUMO.")
+    if not os.path.isfile(path):
+        raise ValueError(f"{str(path)[-200:]!r} is no file. Give the path of an XML file of SUMO.")
     opener = gzip.open if path.suffix == ".gz" else open
     cure = f"Give a file with <{'> or <'.join(roots)}>, as SUMO's tools write it."
     try:

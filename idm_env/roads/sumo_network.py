@@ -106,10 +106,8 @@ class _Reader:
             self.following[start] = via or end
         elif {start, end} <= self.cars:
             if via is None:
-                raise ValueError(
-                    f"{name(connection)} has no via: {self.path.name} has no internal links. "
-                    "Build it with netconvert, without --no-internal-links."
-                )
+                cure = "Build it with netconvert, without --no-internal-links."
+                raise ValueError(f"{name(connection)} has no via: {self.path.name} has no internal links. {cure}")
             signal, free = connection.get("tl"), connection.get("pass") in ("true", "1")
             if signal is not None and signal not in self.signals:
                 raise ValueError(f'{name(connection)}: tl="{signal}" has no tlLogic. Add its program to the network.')
@@ -124,10 +122,8 @@ class _Reader:
         for junction, inner, rows in self.requests:
             for row in rows:
                 if not row[0] < len(inner) == len(rows) == len(row[1]) == len(row[2]):
-                    raise ValueError(
-                        f'<junction id="{junction}">: request {row[0]} needs as many foes and responses as there are '
-                        f"requests ({len(rows)}) and intLanes ({len(inner)}). Build it with netconvert."
-                    )
+                    needs = f"needs {len(rows)} foes, responses and intLanes, one for each request"
+                    raise ValueError(f'<junction id="{junction}">: request {row[0]} {needs}. Build it with netconvert.')
                 mine = owner.get(inner[row[0]])
                 for lane, foe, first in zip(inner, row[1][::-1], row[2][::-1], strict=True):
                     if mine is not None and lane in owner:  # not of pedestrians, bicycles or trains

@@ -51,9 +51,14 @@ def task_with(task: str, choices: Mapping[str, Any], others: Iterable[str] = ())
         raise ValueError(f"task '{task}' stands on a network, which only Gymnasium and PettingZoo make. Use gym.make.")
     if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"unknown task {shown(task)}.{nearest(shown(task), [*TASKS, *ON_NETWORKS])}")
-    names = [f.name for f in dataclasses.fields(TASKS[task]) if f.init]
+    return with_keywords(task, TASKS[task], choices, others)
+
+
+def with_keywords(task: str, kind: Any, choices: Mapping[str, Any], others: Iterable[str] = ()) -> Any:
+    """Return the task of a kind, a dataclass; KeywordError for a keyword that is none, nor one of ``others``."""
+    names = [f.name for f in dataclasses.fields(kind) if f.init]
     for choice in choices:
         if choice not in names:
             like = nearest(str(choice), [name for name in (*names, *others) if name != choice])
             raise KeywordError(f"task '{task}' got an unexpected keyword argument {shown(choice)}.{like}")
-    return TASKS[task](**choices)
+    return kind(**choices)

@@ -87,9 +87,9 @@ class JunctionTask(NetworkTask):
     name: ClassVar[str] = "junction"
     rewards: ClassVar[tuple[str, ...]] = ("unit", "delay")
     control: ClassVar[str] = "priority"
+    actions: ClassVar[str] = "numbers from −1 to 1"
     machinery: ClassVar[tuple[Effect, ...]] = (Control(careful=True, added=True),)
     ranges: ClassVar[Mapping[str, Range]] = {
-        **NetworkTask.ranges,
         "agents": Range(1, 1000, whole=True),
         "circling": Range(1, 10_000, whole=True),
         "max_command": Range(0.1, 9.0, "m/s²"),
@@ -98,9 +98,13 @@ class JunctionTask(NetworkTask):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.is_closed:
+            self.leave_out(f"nobody arrives on network = {shown(self.network)}", "inflow", "turns", "randomise")
+        else:
+            self.leave_out(f"inflow or trips arrive on network = {shown(self.network)}", "circling")
         if self.agents > self.vehicles:
             raise ValueError(f"agents = {self.agents} must be at most the vehicles, {self.vehicles}.")
-        _ = self.simulator, self.inflows, self._demand
+        _ = self.params
 
     # -- static facts ------------------------------------------------------------------------------------------------
 
@@ -143,11 +147,9 @@ class JunctionTask(NetworkTask):
         """Return worlds at the beginning of an episode: empty, with everybody's departure drawn."""
         return DrivenWorld(self.begin_state(draw), np.full((len(draw.key), self.agents), -1))
 
-    def check_actions(self, actions: Array, shape: tuple[int, int]) -> Array:
-        """Return the actions of worlds, ``shape`` (B, S); ValueError where they are no numbers."""
-        if actions.shape != shape or actions.dtype.kind not in "iuf" or not np.isfinite(actions).all():
-            raise ValueError(f"actions {shown(actions)} must be numbers from −1 to 1, of shape {shape}.")
-        return actions
+    def are_actions(self, array: Array) -> bool:
+        """Return whether all are numbers."""
+        return array.dtype.kind in "iuf" and bool(np.isfinite(array).all())
 
     def step(self, world: DrivenWorld, actions: Array | None) -> tuple[DrivenWorld, NetworkStep]:
         """Return worlds ``hold`` seconds later, and the outcome; ``actions`` (B, S) in [−1, 1], None for none."""

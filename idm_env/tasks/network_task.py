@@ -6,9 +6,12 @@ Shapes: B worlds, N vehicles, L links, R routes of at most H links, S agents.
 from __future__ import annotations
 
 import math
+import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -22,10 +25,10 @@ from idm_env.roads.network_demand import Demand, without_turns_back
 from idm_env.roads.ways import Ways, keyed
 from idm_env.simulator import Simulator
 from idm_env.tasks.behaviour import Behaviour, behaviour
-from idm_env.tasks.checks import Range, in_ranges, two_ends
+from idm_env.tasks.checks import Range, by_name, in_ranges, two_ends
 from idm_env.tasks.random import Draw
 from idm_env.types import Journeys, State, mapped
-from idm_env.validation import one_of, shown
+from idm_env.validation import nearest, one_of, shown
 
 _ROUTES = 256
 """Routes from each entry, drawn once, among which every vehicle chooses."""
@@ -70,6 +73,8 @@ class NetworkTask:
     """Effects through which agents act."""
     control: ClassVar[str]
     """What rules at junctions of networks by name."""
+    actions: ClassVar[str]
+    """What actions are."""
     counts: ClassVar[Array | None] = None
     """Number of actions of each agent (S); None for one number from −1 to 1."""
     ranges: ClassVar[Mapping[str, Range]] = {
@@ -80,13 +85,27 @@ class NetworkTask:
     }
 
     def __post_init__(self) -> None:
+        for name, kinds, rule in (
+            ("network", (str, os.PathLike, Network), "a name such as 'grid 5x5', the path of a .net.xml, or a Network"),
+            ("trips", (str, os.PathLike, type(None)), "the path of a .rou.xml, or None"),
+        ):
+            if not isinstance(value := getattr(self, name), kinds) or value == "":
+                raise ValueError(f"{name} = {shown(value)} must be {rule}.")
         in_ranges(self)
         one_of("reward", self.reward, self.rewards)
-        for name in {*(self.randomise or {})} - {"inflow"}:
+        turns = [x for x in self.turns if isinstance(x, Real)] if isinstance(self.turns, Sequence) else []
+        if len(turns) != 3 or len(self.turns) != 3 or not (min(turns) >= 0.0 and 0.0 < sum(turns) < 1e9):
+            raise ValueError(f"turns = {shown(self.turns)} must be three numbers from 0 on: left, straight on, right.")
+        for name in {*by_name("randomise", {} if self.randomise is None else self.randomise)} - {"inflow"}:
             raise ValueError(f"randomise.{shown(name)} cannot be drawn in task '{self.name}', where inflow can.")
-        usual = (type(self).inflow, type(self).turns)
-        if self.trips is not None and (self.randomise or (self.inflow, self.turns) != usual):
-            raise ValueError(f"trips = {shown(self.trips)} are all who arrive. Leave out inflow, turns and randomise.")
+        if self.trips is not None:
+            self.leave_out(f"trips = {shown(self.trips)} are all who arrive", "inflow", "turns", "randomise")
+
+    def leave_out(self, reason: str, *names: str) -> None:
+        """Raise ValueError for options that change nothing, and are not what they are by default."""
+        for name in names:
+            if (value := getattr(self, name)) != getattr(type(self), name) and value != {}:
+                raise ValueError(f"{name} = {shown(value)} changes nothing: {reason}. Leave {name} out.")
 
     # -- static facts ------------------------------------------------------------------------------------------------
 
@@ -94,16 +113,16 @@ class NetworkTask:
     def _read(self) -> tuple[Network, Demand | None]:
         network = self.network
         if not isinstance(network, Network):
-            words = ("grid 1x1" if network == "crossing" else str(network)).split()
-            sides = words[1].split("x") if len(words) == 2 else []
-            if str(network) in NAMED:
-                network = NAMED[str(network)]()
-            elif words[:1] != ["grid"]:
-                network = Network.from_sumo(network)
-            elif len(sides) == 2 and all(side.isdecimal() and 0 < int(side) < 100 for side in sides):
-                network = Network.grid(int(sides[0]), int(sides[1]), control=self.control)
+            name = "grid 1x1" if network == "crossing" else str(network)
+            if name in NAMED:
+                network = NAMED[name]()
+            elif sides := re.fullmatch(r"grid (\d+)x(\d+)", name):
+                network = Network.grid(int(sides[1]), int(sides[2]), control=self.control)
+            elif os.path.isfile(name):
+                network = Network.from_sumo(name)
             else:
-                raise ValueError(f"network = {shown(network)} must be such as 'grid 5x5', 1 to 99 each way.")
+                near = nearest(name, ("crossing", *NAMED, "grid 5x5"))
+                raise ValueError(f"network = {shown(name)} is neither a file nor a name.{near}")
         return network, None if self.trips is None else Demand.from_sumo(network, self.trips, end=self.duration)
 
     @property
@@ -139,7 +158,7 @@ class NetworkTask:
         """Least and most inflow of an episode (vehicles per hour and entry)."""
         low, high = two_ends("randomise.inflow", (self.randomise or {}).get("inflow", (self.inflow,) * 2))
         for end in (low, high):
-            self.ranges["inflow"].check("randomise.inflow", end)
+            NetworkTask.ranges["inflow"].check("randomise.inflow", end)
         return low, high
 
     @cached_property
@@ -165,12 +184,8 @@ class NetworkTask:
         if self._read[1] is not None:
             return self._read[1]
         # As many routes of every entry as of any other: whoever arrives takes one of all.
-        routes = [
-            self._ways.draw_route(edge, self.turns, random)
-            for edge in self._ways.entries
-            for random in [keyed(0, edge)]
-            for _ in range(_ROUTES)
-        ]
+        random = {edge: keyed(0, edge) for edge in self._ways.entries}
+        routes = [self._ways.draw_route(edge, self.turns, x) for edge, x in random.items() for _ in range(_ROUTES)]
         return Demand(padded(routes), np.zeros(self.vehicles), np.zeros(self.vehicles))
 
     @cached_property
@@ -181,6 +196,20 @@ class NetworkTask:
         return total - each, total[:, -1]
 
     # -- pure functions ----------------------------------------------------------------------------------------------
+
+    def check_actions(self, actions: Any, shape: tuple[int, ...]) -> Array:
+        """Return actions as an array of this shape. ValueError for another shape or type."""
+        try:
+            array = np.asarray(actions)
+        except ValueError:  # rows of several lengths
+            array = np.array(None)
+        if array.shape != shape or not self.are_actions(array):
+            raise ValueError(f"actions {shown(actions)} must be {self.actions}, of shape {shape}.")
+        return array
+
+    def are_actions(self, array: Array) -> bool:
+        """Return whether all of an array, of any type, are actions."""
+        raise NotImplementedError
 
     def begin_state(self, draw: Draw) -> State:
         """Return worlds at the beginning of an episode: empty, with everybody's departure drawn."""
@@ -201,10 +230,8 @@ class NetworkTask:
 
     def _arrivals(self, draw: Draw) -> tuple[torch.Tensor, torch.Tensor]:
         """Return of each vehicle which route it takes, and at which step it is due (B, N): a Poisson process."""
-        share, gap, choice = (
-            draw.stream(f"{self.name}.{what}").uniforms(0, n, torch.float64)
-            for what, n in (("inflow", 1), ("gap", self.vehicles), ("route", self.vehicles))
-        )
+        sizes = {"inflow": 1, "gap": self.vehicles, "route": self.vehicles}
+        share, gap, choice = (draw.stream(f"{self.name}.{k}").uniforms(0, n, torch.float64) for k, n in sizes.items())
         (low, high), entries = self.inflows, len(self._ways.entries)
         # Those who go round enter as soon as there is room.
         rate = torch.ones_like(share) if self.is_closed else (low + (high - low) * share) * entries / 3600.0

@@ -107,10 +107,8 @@ class OpenHighwayTask(OpenLanesTask):
         evenly = tuple(spread("exits_share", {"exit": self.exits_share}, self.vehicles, SECOND))
         places = evenly if self.table is None else self.table.destination
         leaves = torch.tensor([x == "exit" for x in places], device=device)
-        own = {
-            "first": torch.where(leaves, 0.0, 1.0), "last": torch.where(leaves, 0.0, 1000.0),
-            "place": torch.full((self.vehicles,), off[1], device=device),
-        }  # fmt: skip
+        first, last = torch.where(leaves, 0.0, 1.0), torch.where(leaves, 0.0, 1000.0)
+        own = {"first": first, "last": last, "place": torch.full((self.vehicles,), off[1], device=device)}
         mine = {name: x.to(dtype) for name, x in own.items()}
         return {**values, "destination": {**values["destination"], **mine}}
 

@@ -67,11 +67,8 @@ class SignalsTask(NetworkTask):
     name: ClassVar[str] = "signals"
     rewards: ClassVar[tuple[str, ...]] = ("unit", "delay", "queue", "pressure")
     control: ClassVar[str] = "signals"
-    ranges: ClassVar[Mapping[str, Range]] = {
-        **NetworkTask.ranges,
-        "least_green": Range(0.0, 600.0, "s"),
-        "amber": Range(0.0, 60.0, "s"),
-    }
+    actions: ClassVar[str] = "phases: whole numbers from 0 on"
+    ranges: ClassVar[Mapping[str, Range]] = {"least_green": Range(0.0, 600.0, "s"), "amber": Range(0.0, 60.0, "s")}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -81,7 +78,7 @@ class SignalsTask(NetworkTask):
             raise ValueError(f"network = {shown(self.network)} has no signal with two phases. Give one that has.")
         if self.is_closed:
             raise ValueError(f"network = {shown(self.network)} has no open end: others lead to each edge. Give trips.")
-        _ = self.simulator, self.inflows, self._demand
+        _ = self.params
 
     # -- static facts ------------------------------------------------------------------------------------------------
 
@@ -153,11 +150,9 @@ class SignalsTask(NetworkTask):
         shape = len(draw.key), len(self.agents)
         return World(self.begin_state(draw), np.zeros(shape, np.int64), np.full(shape, np.inf))
 
-    def check_actions(self, actions: Array, shape: tuple[int, int]) -> Array:
-        """Return the actions of worlds, ``shape`` (B, S); ValueError where they are no phases."""
-        if actions.shape != shape or actions.dtype.kind not in "iu" or (actions < 0).any():
-            raise ValueError(f"actions {shown(actions)} must be phases: whole numbers from 0 on, of shape {shape}.")
-        return actions
+    def are_actions(self, array: Array) -> bool:
+        """Return whether all are phases."""
+        return array.dtype.kind in "iu" and bool((array >= 0).all())
 
     def step(self, world: World, actions: Array | None) -> tuple[World, NetworkStep]:
         """Return worlds ``hold`` seconds later, and the outcome; ``actions`` (B, S) are phases.

@@ -23,11 +23,17 @@ from tests.networks import laws
 
 NETWORKS = ("crossing", "roundabout", "figure eight")
 SMALL: dict[str, Any] = {"duration": 60.0, "inflow": 600.0, "agents": 4}
+EIGHT: dict[str, Any] = {"network": "figure eight", "inflow": 300.0}
 
 
 def vector(count: int = 2, **keywords: Any) -> NetworkVectorEnv:
     """Return a vector as a user makes it."""
     return gymnasium.make_vec("DiffIDM-v0", count, task="junction", **{**SMALL, **keywords})  # type: ignore[return-value]
+
+
+def of_network(network: str) -> dict[str, Any]:
+    """Return the keywords of a network: on the figure eight nobody arrives."""
+    return {"network": network} | {k: v for k, v in SMALL.items() if network != "figure eight" or k != "inflow"}
 
 
 def decided(env: NetworkVectorEnv) -> State:
@@ -40,7 +46,7 @@ def decided(env: NetworkVectorEnv) -> State:
 @pytest.mark.parametrize("network", NETWORKS)
 def test_who_does_nothing_is_human_traffic(network: str) -> None:
     """Actions of 0 and above, or none, are the very bits of a simulator that knows no agents."""
-    task = JunctionTask(**{**SMALL, "network": network})
+    task = JunctionTask(**of_network(network))
     world = first = task.begin(Draw.of(torch.tensor([3, 4]), torch.tensor([0, 0])))
     driven = world
     for k in range(40):
@@ -57,10 +63,9 @@ def test_who_does_nothing_is_human_traffic(network: str) -> None:
 
 @pytest.mark.parametrize("network", NETWORKS)
 def test_nobody_overlaps_and_no_foes_meet_whatever_agents_do(network: str) -> None:
-    env, random = (
-        vector(12, network=network, agents=12, hold=0.5, duration=120.0, circling=20),
-        np.random.default_rng(1),
-    )
+    circling = {"circling": 20, "inflow": 300.0} if network == "figure eight" else {}
+    keywords = {"network": network, "agents": 12, "hold": 0.5, "duration": 120.0, **circling}
+    env, random = vector(12, **keywords), np.random.default_rng(1)
     env.reset(seed=1)
     moved, after = 0, decided(env)
     for _ in range(239):
@@ -131,7 +136,7 @@ def test_an_agent_can_hold_back() -> None:
     """Who brakes all the time stands, and those behind him lose their time: the world's share falls."""
     rewards = {}
     for action in (0.0, -1.0):
-        env = vector(4, network="figure eight")
+        env = vector(4, network="figure eight", inflow=300.0)
         env.reset(seed=1)
         rewards[action] = np.mean([env.step(np.full((4, 4), action))[1] for _ in range(59)])
     assert rewards[-1.0] < rewards[0.0] - 0.1
@@ -156,7 +161,11 @@ def test_faces() -> None:
         ({"network": "crossroads.net.xml"}, "crossroads.net.xml"),
         ({"netwrok": "crossing"}, "task 'junction' got an unexpected keyword argument 'netwrok'."),
         ({"agents": 0}, "agents = 0"),
-        ({"agents": 15, "network": "figure eight"}, "agents = 15 must be at most the vehicles, 14."),
+        ({"circling": 20}, "circling = 20 changes nothing: inflow or trips arrive on network = 'crossing'. L"),
+        ({"network": "figure eight"}, "inflow = 600.0 changes nothing: nobody arrives on network = 'figure eight'."),
+        ({**EIGHT, "turns": (0.0, 1.0, 0.0)}, "turns = (0.0, 1.0, 0.0) changes nothing: nobody arrives"),
+        ({**EIGHT, "randomise": {"inflow": [1, 2]}}, "randomise = {'inflow': [1, 2]} changes nothing: nobody arrives"),
+        ({"agents": 15, **EIGHT}, "agents = 15 must be at most the vehicles, 14."),
         ({"reward": "wait"}, "reward = 'wait' is unknown."),
         ({"turns": (0.0, -1.0, 0.0)}, "must be three numbers from 0 on: left, straight on, right."),
         ({"max_command": -1.0}, "max_command = -1 m/s²"),

@@ -196,15 +196,29 @@ def test_faces() -> None:
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"network": "grid 5"}, "network = 'grid 5' must be such as 'grid 5x5', 1 to 99 each way."),
+        ({"network": "grid 5"}, "network = 'grid 5' is neither a file nor a name. Did you mean 'grid 5x5'?"),
+        ({"network": "grid 0x5"}, "rows = 0 must be at least 1."),
+        ({"network": 5}, "network = 5 must be a name such as 'grid 5x5', the path of a .net.xml, or a Network."),
+        ({"network": ""}, "network = '' must be a name"),
+        ({"network": "a" * 5000}, "is neither a file nor a name."),
+        ({"trips": 5}, "trips = 5 must be the path of a .rou.xml, or None."),
+        ({"trips": "\n", "inflow": 300.0}, r"'\n' is no file. Give the path of an XML file of SUMO."),
+        ({"turns": None}, "turns = None must be three numbers"),
+        ({"turns": (None, 1.0, 1.0)}, "turns = (None, 1.0, 1.0) must be three numbers"),
+        ({"turns": (0, 0, 0)}, "turns = (0, 0, 0) must be three numbers"),
+        ({"randomise": 0}, "randomise = 0 must be a mapping from names."),
+        ({"parameters": {"idm.time_gap": float("nan")}}, "idm.time_gap = nan must be a finite number."),
+        ({"parameters": {"idm": {"a": 1}}}, "idm.a"),
+        ({"max_episode_steps": 10**400}, "00000 must be at most 17280."),
+        ({"max_episode_steps": 5, "hold": "x"}, "hold = 'x' must be a finite number of s."),
         ({"netwrok": "grid 1x1"}, "unexpected keyword argument 'netwrok'. Did you mean 'network'?"),
         ({"amber": 6.0}, "amber = 6 s must be at most hold = 5 s."),
         ({"reward": "wait"}, "reward = 'wait' is unknown."),
         ({"randomise": {"turns": [0, 1]}}, "randomise.'turns' cannot be drawn in task 'signals', where inflow can."),
         ({"inflow": -1.0}, "inflow = -1 veh/h"),
-        ({"trips": "a.rou.xml", "inflow": 500.0}, "trips = 'a.rou.xml' are all who arrive. Leave out inflow"),
-        ({"trips": "a.rou.xml", "randomise": {"inflow": [1, 2]}}, "Leave out inflow, turns and randomise."),
-        ({"trips": "a.rou.xml", "turns": (0.0, 1.0, 0.0)}, "are all who arrive. Leave out"),
+        ({"trips": "a.rou.xml", "inflow": 500.0}, "inflow = 500.0 changes nothing: trips = 'a.rou.xml' are all who"),
+        ({"trips": "a.rou.xml", "inflow": 300.0, "randomise": {"inflow": [1, 2]}}, "Leave randomise out."),
+        ({"trips": "a.rou.xml", "inflow": 300.0, "turns": (0.0, 1.0, 0.0)}, "are all who arrive. Leave turns out."),
         ({"turns": (0.0, 1.0)}, "must be three numbers from 0 on: left, straight on, right."),
         ({"network": Network.roundabout()}, "has no signal with two phases. Give one that has."),
     ],
@@ -236,6 +250,34 @@ def test_actions_that_are_none() -> None:
     with pytest.raises(RuntimeError, match="Call reset"):
         env.step(None)
     env.reset(seed=0)
-    for wrong in (np.zeros((2, 3), int), np.zeros((2, 2)), np.full((2, 2), -1)):
-        with pytest.raises(ValueError, match="must be phases"):
-            env.step(wrong)
+    wrong: list[Any] = [np.zeros((2, 3), int), np.zeros((2, 2)), np.full((2, 2), -1), np.zeros(5, int), [[0, 1], [1]]]
+    for actions in (*wrong, np.zeros((1, 4), int), 5, "a", [[True, False]] * 2, [[None, 1]] * 2):
+        with pytest.raises(
+            ValueError, match=r"^actions .* must be phases: whole numbers from 0 on, of shape \(2, 2\)\.$"
+        ):
+            env.step(actions)
+    many = parallel_env(task="signals", **SMALL)
+    many.reset(seed=0)
+    for given, words in (
+        ([0, 1], "actions = .* must be a mapping"),
+        ({"A0": [0, 1], "B0": 0}, "no action for agent 'A0'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            many.step(given)
+    with pytest.raises(ValueError, match="shared = 5 must be True or False"):
+        vector(2, shared=5)
+
+
+def test_seeds_of_rows_and_options_that_are_none() -> None:
+    """A seed for each row is that row's; a wrong number of seeds, or an option, is told."""
+    one, many = vector(2), vector(2)
+    first, rows = one.reset(seed=7)[0], [many.reset(seed=seeds)[0] for seeds in ([3, 7], [7, 8])]
+    firsts = [[env.step(None)[0] for _ in range(20)][-1] for env in (one, many)]
+    np.testing.assert_array_equal(first, rows[1])
+    np.testing.assert_array_equal(firsts[0], firsts[1])
+    many.reset(seed=[3, 7])
+    np.testing.assert_array_equal([many.step(None)[0] for _ in range(20)][-1][1], firsts[0][0])
+    with pytest.raises(ValueError, match="must be a number, or one for each of 2 rows"):
+        many.reset(seed=[1])
+    with pytest.raises(ValueError, match="unknown reset option 'state'"):
+        many.reset(options={"state": None})

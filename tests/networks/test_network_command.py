@@ -90,7 +90,7 @@ def test_an_interrupted_run_goes_on(files: tuple[Path, Path], tmp_path: Path, mo
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["{0}", "missing.rou.xml"], "missing.rou.xml is no file"),
+        (["{0}", "missing.rou.xml"], "missing.rou.xml' is no file"),
         (["{1}", "{1}"], "my.rou.xml begins with <routes>"),
         (["{0}", "{0}"], "my.net.xml begins with <net>"),
         (["{0}", "{1}", "--seconds", "0"], "--seconds = 0 s is outside"),
