@@ -172,14 +172,16 @@ class Network(Road):
     @classmethod
     def grid(
         cls, rows: int, columns: int, *, block: float = 200.0, arm: float = 200.0, limit: float = 13.89,
-        control: str = "signals", green: float = 42.0, amber: float = 3.0,
+        control: str = "signals", green: float = 42.0, amber: float = 3.0, lanes: int = 1,
     ) -> Network:  # fmt: skip
         """Return so many crossings, ``block`` m apart, around them arms of ``arm`` m; names are netgenerate's.
+
+        Of several ``lanes`` a direction the right one turns right, the left one turns left, and each goes on.
 
         ``control`` is signals, priority (streets from south to north), right_before_left or none. ValueError for
         numbers that allow no grid.
         """
-        return cls._from_plain(streets.grid(rows, columns, block, arm, limit, control).tables(green, amber))
+        return cls._from_plain(streets.grid(rows, columns, block, arm, limit, control, lanes).tables(green, amber))
 
     @classmethod
     def crossing(cls, **options: Any) -> Network:

@@ -1,6 +1,7 @@
 """Networks of our own: grids, a crossing, a roundabout and a figure eight, with foes and priorities from geometry.
 
-A road is one lane wide and one way; traffic keeps to the right. Where roads meet, every way through is a Bézier curve.
+A road is one way, of one lane or, in grids, of several from right to left; traffic keeps to the right. One turns right
+from the right lane, left from the left one, and goes on from each. Where roads meet, a way through is a Bézier curve.
 Two ways from different roads are foes where they end on the same road or come nearer than ``WIDTH``. Points in m.
 Foes and yields are netgenerate's for the same grid; of two oncoming left turns it takes the one or the other first.
 """
@@ -27,10 +28,11 @@ CONTROLS = ("signals", "priority", "right_before_left", "none")
 
 
 class _Way(NamedTuple):
-    """A way through a junction: its roads, points ``(k, 2)``, turn to the left (rad), heading (rad), rank and phase."""
+    """A way through a junction: roads, lane, points ``(k, 2)``, turn to the left and heading (rad), rank and phase."""
 
     start: str
     end: str
+    lane: int
     points: np.ndarray
     turn: float
     heading: float
@@ -44,50 +46,54 @@ class Streets:
     def __init__(self, limit: float, control: str) -> None:
         self.limit = validation.in_interval("limit", float(limit), 0.5, 100.0, "m/s")
         self.control = validation.one_of("control", control, CONTROLS)
-        self.roads: dict[str, np.ndarray] = {}
+        self.roads: dict[str, list[np.ndarray]] = {}
         self.junctions: list[tuple[str, list[_Way]]] = []
 
-    def add_road(self, name: str, points: Any) -> None:
-        """Add a road along points ``(k, 2)``."""
-        self.roads[name] = np.asarray(points, float)
+    def add_road(self, name: str, *lanes: Any) -> None:
+        """Add a road with each of its lanes along points ``(k, 2)``."""
+        self.roads[name] = [np.asarray(points, float) for points in lanes]
 
-    def add_street(self, names: tuple[str, str], ends: tuple[Any, Any], radii: tuple[float, float]) -> None:
+    def add_street(self, names: tuple[str, str], ends: Any, radii: tuple[float, float], lanes: int) -> None:
         """Add both roads of a straight street between two junctions of some radii."""
         for name, (a, b), (near, far) in zip(names, (ends, ends[::-1]), (radii, radii[::-1]), strict=True):
             a, b = np.asarray(a, float), np.asarray(b, float)
             along = (b - a) / np.linalg.norm(b - a)
-            right = OFFSET * np.array([along[1], -along[0]])
-            self.add_road(name, [a + near * along + right, b - far * along + right])
+            sides = [OFFSET * k * np.array([along[1], -along[0]]) for k in range(2 * lanes - 1, 0, -2)]
+            self.add_road(name, *([a + near * along + side, b - far * along + side] for side in sides))
 
     def join(self, junction: str, pairs: Mapping[tuple[str, str], tuple[int, int]]) -> None:
         """Add a junction: pairs of roads that it leads from and to, each with a rank (the higher first) and a phase."""
         ways = []
         for (start, end), (rank, phase) in pairs.items():
-            (a, b), (c, d) = self.roads[start][-2:], self.roads[end][:2]
-            first, last = (math.atan2(*(q - p)[::-1]) for p, q in ((a, b), (c, d)))
-            turn = (last - first + math.pi) % (2.0 * math.pi) - math.pi
-            ways.append(_Way(start, end, _bend(b, first, c, last), turn, first, rank, phase))
+            for lane, ((*_, a, b), (c, d, *_)) in enumerate(zip(self.roads[start], self.roads[end], strict=True)):
+                first, last = (math.atan2(*(q - p)[::-1]) for p, q in ((a, b), (c, d)))
+                turn = (last - first + math.pi) % (2.0 * math.pi) - math.pi
+                if lane == (len(self.roads[start]) - 1 if turn > STRAIGHT else 0 if turn < -STRAIGHT else lane):
+                    ways.append(_Way(start, end, lane, _bend(b, first, c, last), turn, first, rank, phase))
         self.junctions.append((junction, ways))
 
     def tables(self, green: float = 42.0, amber: float = 3.0) -> NetworkTables:
         """Return the tables of all; signals show every phase ``green`` seconds and ``amber`` (s)."""
-        links: dict[str, list[Any]] = {key: [] for key in ("name", "length", "limit", "inner", "edge", "shape")}
+        columns = ("name", "length", "limit", "inner", "edge", "shape", "right", "left")
+        links: dict[str, list[Any]] = {key: [] for key in columns}
         keys = ("start", "end", "path", "foes", "yields", "signal", "index")
         moves: dict[str, list[Any]] = {key: [] for key in keys}
         plans = []
-        for name, points in self.roads.items():
-            _add(links, (f"{name}_0", _length(points), self.limit, False, name, points))
+        for name, lanes in self.roads.items():
+            names = [None, *(f"{name}_{k}" for k in range(len(lanes))), None]
+            for points, right, own, left in zip(lanes, names, names[1:], names[2:], strict=False):
+                _add(links, (own, _length(points), self.limit, False, name, points, right, left))
         for junction, ways in self.junctions:
             first, has_signal = len(moves["start"]), self.control == "signals" and len({way.phase for way in ways}) > 1
             for i, way in enumerate(ways):
                 edge, length, excess = f":{junction}_{i}", _length(way.points), abs(way.turn) - FREE_TURN
                 limit = math.sqrt(TURN_ACCEL * length / excess) if excess > 0.0 else math.inf
-                _add(links, (f"{edge}_0", length, min(self.limit, limit), True, edge, way.points))
+                _add(links, (f"{edge}_0", length, min(self.limit, limit), True, edge, way.points, None, None))
                 foes = [j for j, other in enumerate(ways) if _conflict(way, other)]
                 yields = [first + j for j in foes if self._goes_first(ways[j], way, j < i)]
                 signal = (junction, i) if has_signal else (None, None)
-                row = f"{way.start}_0", f"{way.end}_0", [f"{edge}_0"], [first + j for j in foes], yields, *signal
-                _add(moves, row)
+                start, end = f"{way.start}_{way.lane}", f"{way.end}_{way.lane}"
+                _add(moves, (start, end, [f"{edge}_0"], [first + j for j in foes], yields, *signal))
             if has_signal:
                 plans.append((junction, *_phases(ways, green, amber), 0.0))
         return NetworkTables(links, moves, plans, Counter())
@@ -143,10 +149,12 @@ def _conflict(one: _Way, other: _Way) -> bool:
     if one.start == other.start:
         return False
     apart = np.linalg.norm(one.points[:, None] - other.points[None], axis=-1)
-    return one.end == other.end or float(apart.min()) < WIDTH
+    # Whoever turns may turn beside one who turns onto another lane.
+    merges = one.end == other.end and (one.lane == other.lane or min(abs(one.turn), abs(other.turn)) < STRAIGHT)
+    return merges or float(apart.min()) < WIDTH
 
 
-def grid(rows: int, columns: int, block: float, arm: float, limit: float, control: str) -> Streets:
+def grid(rows: int, columns: int, block: float, arm: float, limit: float, control: str, lanes: int) -> Streets:
     """Return a grid of so many crossings, ``block`` m apart, with arms of ``arm`` m; names are netgenerate's.
 
     Crossing ``B0`` is that of the second column and the first row, arms are ``left0``, ``right0``, ``bottom0``,
@@ -155,8 +163,9 @@ def grid(rows: int, columns: int, block: float, arm: float, limit: float, contro
     ValueError for a number that allows no grid.
     """
     rows, columns = validation.whole("rows", rows, 1, 100), validation.whole("columns", columns, 1, 26)
+    radius = RADIUS + 2.0 * OFFSET * (validation.whole("lanes", lanes, 1, 4) - 1)
     for key, value in (("block", block), ("arm", arm)):
-        validation.in_interval(key, float(value), 2.0 * RADIUS + 5.0, 1e5, "m")
+        validation.in_interval(key, value, 2.0 * radius + 5.0, 1e5, "m")
     streets = Streets(limit, control)
     nodes = {f"{chr(65 + i)}{j}": (arm + i * block, arm + j * block) for i in range(columns) for j in range(rows)}
     arms: dict[str, list[tuple[int, str]]] = {name: [] for name in nodes}
@@ -168,7 +177,7 @@ def grid(rows: int, columns: int, block: float, arm: float, limit: float, contro
         upright = "bottom" in a or "top" in b or (a in nodes and b in nodes and a[0] == b[0])
         step = np.array([0.0, 1.0] if upright else [1.0, 0.0])
         ends = nodes.get(a) or tuple(nodes[b] - arm * step), nodes.get(b) or tuple(nodes[a] + arm * step)
-        streets.add_street((f"{a}{b}", f"{b}{a}"), ends, (RADIUS * (a in nodes), RADIUS * (b in nodes)))
+        streets.add_street((f"{a}{b}", f"{b}{a}"), ends, (radius * (a in nodes), radius * (b in nodes)), lanes)
         for name, neighbour, side in ((a, b, 1 - upright), (b, a, 3 - upright)):
             if name in nodes:
                 arms[name].append((side, neighbour))

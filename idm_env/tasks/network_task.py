@@ -116,8 +116,9 @@ class NetworkTask:
             name = "grid 1x1" if network == "crossing" else str(network)
             if name in NAMED:
                 network = NAMED[name]()
-            elif sides := re.fullmatch(r"grid (\d+)x(\d+)", name):
-                network = Network.grid(int(sides[1]), int(sides[2]), control=self.control)
+            elif size := re.fullmatch(r"grid (\d+)x(\d+)(?:x(\d+))?", name):
+                rows, columns, lanes = (int(x or 1) for x in size.groups())
+                network = Network.grid(rows, columns, lanes=lanes, control=self.control)
             elif os.path.isfile(name):
                 network = Network.from_sumo(name)
             else:

@@ -13,8 +13,11 @@ from pettingzoo.test import parallel_api_test
 import idm_env  # noqa: F401 (registers the environments)
 from idm_env.envs.network_faces import NetworkEnv, NetworkVectorEnv
 from idm_env.envs.pettingzoo import parallel_env
-from idm_env.multilane.junctions import by_link, counts, travel_time
+from idm_env.multilane.junctions import by_link, counts, journeys_of, travel_time
 from idm_env.roads.network import Network
+from idm_env.roads.ways import Ways
+from tests.envs.test_junction import decided
+from tests.networks import laws
 
 SMALL: dict[str, Any] = {"network": "grid 1x2", "inflow": 400.0, "duration": 200.0}
 
@@ -175,6 +178,36 @@ def test_who_sees_traffic_does_better_than_chance() -> None:
 def _shown(env: NetworkVectorEnv, s: int, phase: int, link: int) -> str:
     net = env.task.road
     return "".join(env.task.phases[s][phase][i] for i in net.index[(net.signal == s) & (net.start == link)])
+
+
+def test_two_lanes_let_twice_as_many_through() -> None:
+    """A queue on each lane empties as on one."""
+    arrived = []
+    for lanes in (1, 2):
+        env = vector(2, network=f"grid 1x1x{lanes}", inflow=900.0 * lanes, turns=(0.0, 1.0, 0.0), duration=400.0)
+        arrived.append(run(env, lambda k: None, steps=79)[-1][-1]["arrived"].mean())
+    assert arrived[0] > 150
+    assert arrived[1] == pytest.approx(2.0 * arrived[0], rel=0.03)
+
+
+def test_each_of_two_lanes_goes_on_and_turns_to_its_side() -> None:
+    """Nobody overlaps, meets a foe or runs red; all four ways of an approach are used."""
+    keywords = {"inflow": 900.0, "turns": (0.2, 0.6, 0.2), "hold": 0.5, "amber": 0.5}
+    env = vector(3, network="grid 1x2x2", duration=200.0, **keywords)
+    env.reset(seed=1)
+    net, after = env.task.road, decided(env)
+    for _ in range(399):
+        before = after
+        env.step(None)
+        after = decided(env)
+        assert laws.broken(env.task.simulator, before, after) == []
+    ways = journeys_of(after)
+    routes = ways.routes.numpy()[ways.route.numpy()]
+    passed = net.move_of[routes[(np.arange(routes.shape[-1]) < ways.hop.numpy()[..., None]) & (routes >= 0)]]
+    sides, lanes = np.array(Ways(net).sides), np.array([int(name[-1]) for name in net.names])[net.start]
+    used = {(lane, side): int((passed == m).sum()) for m, (lane, side) in enumerate(zip(lanes, sides, strict=True))}
+    assert used.keys() == {(0, 1), (0, 2), (1, 0), (1, 1)}
+    assert min(used.values()) > 0
 
 
 def test_faces() -> None:

@@ -110,24 +110,23 @@ def test_who_turns_by_chance_does_not_turn_back() -> None:
         assert counts[0] == counts[1]
 
 
+@pytest.mark.parametrize("lanes", [1, 2, 3])
 @pytest.mark.parametrize("kind", ["priority", "right_before_left", "traffic_light"])
-def test_a_grid_is_netgenerates(kind: str, tmp_path: Path) -> None:
+def test_a_grid_is_netgenerates(kind: str, lanes: int, tmp_path: Path) -> None:
     """The same links, lengths of links, moves, foes, and yields where moves are open together; and plans.
 
     Of two oncoming left turns netgenerate lets either go first, by the order of its edges.
     """
     home = Path(pytest.importorskip("sumo", reason="SUMO is not installed: pip install eclipse-sumo").SUMO_HOME)
-    words = (
-        "--grid --grid.x-number 3 --grid.y-number 2 --grid.length 200 --grid.attach-length 150 --no-turnarounds -L 1"
-    )
+    words = "--grid --grid.x-number 3 --grid.y-number 2 --grid.length 200 --grid.attach-length 150 --no-turnarounds"
     out = tmp_path / "my.net.xml"
-    tool = [home / "bin" / "netgenerate", *words.split(), "-j", kind, "-o", out]
+    tool = [home / "bin" / "netgenerate", *words.split(), "-L", str(lanes), "-j", kind, "-o", out]
     subprocess.run(tool, check=True, capture_output=True)
     theirs = Network.from_sumo(out)
     control = "signals" if kind == "traffic_light" else kind
-    ours = Network.grid(2, 3, arm=150.0, control=control)
+    ours = Network.grid(2, 3, arm=150.0, control=control, lanes=lanes)
     moves = [{n.move_name(m): m for m in range(len(n.start))} for n in (theirs, ours)]
-    assert moves[0].keys() == moves[1].keys() and len(moves[0]) == 72
+    assert moves[0].keys() == moves[1].keys() and len(moves[0]) == 6 * (8 + 4 * lanes)
     lengths = [{name: n.length[k] for k, name in enumerate(n.names) if not n.inner[k]} for n in (theirs, ours)]
     assert lengths[0] == pytest.approx(lengths[1], abs=0.01)
     for name, mine in moves[1].items():
