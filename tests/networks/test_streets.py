@@ -95,7 +95,7 @@ def test_turns_have_their_shares_and_arrivals_their_rate() -> None:
 
 def test_who_turns_by_chance_does_not_turn_back() -> None:
     """Dead ends at which one can turn, as netgenerate's, bring the same vehicles as open ends."""
-    plain, turning = (streets.grid(2, 2, 200.0, 150.0, 13.89, "signals") for _ in range(2))
+    plain, turning = (streets.grid(2, 2, 200.0, 150.0, 13.89, "signals", 1) for _ in range(2))
     for away in [name for name in turning.roads if name.endswith(("left0", "left1", "right0", "right1", "top0"))]:
         turning.join(away[2:], {(away, away[2:] + away[:2]): (0, 0)})
     open_ends, dead_ends = (Network._from_plain(each.tables()) for each in (plain, turning))
