@@ -3,7 +3,7 @@
 One of them is there once more, with the strengths of effects that are each driver's own.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -62,12 +62,17 @@ class Law(NamedTuple):
         """
         if self.own and self.against["horizon_rmse_m"].outcome is not ErrorChange.BETTER:
             return False
-        return improves(self.against) and self.mean_ratio < 1.0 - LEAST
+        return lowers(self.against)
 
     @property
     def mean_ratio(self) -> float:
         """Geometric mean of the ratios of errors to those of the null; 1 for the null."""
         return mean_ratio(self.against)
+
+
+def lowers(against: Mapping[str, Comparison]) -> bool:
+    """Tell whether errors hold as those of an addition must, and are lower by ``LEAST`` on the whole."""
+    return improves(against) and mean_ratio(against) < 1.0 - LEAST
 
 
 def compared(

@@ -83,33 +83,33 @@ def finished(
         searched: Searches effects beyond another model, whose errors are given.
     """
     judgement, last = judgement_of(evaluation, decided)
-    before, of_laws = evaluation.of_null[1], evaluation
-    laws: list[bases.Law] = []
-    if before is not None:
-        laws = bases.compared(decided.null.model, before, evaluation.of_law, evaluation.seed, on_law)
+    before, of_laws, seed = evaluation.of_null[1], evaluation, evaluation.seed
+    laws = [] if before is None else bases.compared(decided.null.model, before, evaluation.of_law, seed, on_law)
     least = judge.least_m(evaluation.records)
     scored = evaluation.records if evaluation.test is None else evaluation.test
     floor = ceilings.floor(scored, ceilings.drift(trajectories))
     if judgement.is_exact(least):
         judgement = replace(judgement, added=False, refusal=judgement.refusal or Refusal(Reason.SMALL_SIZE, least))
     elif laws:
-        evaluation, decided, judgement, last = _on_the_best((evaluation, decided, judgement, last), laws, searched)
+        noise_m = floor["horizon_rmse_m"]
+        best = best_beyond_noise(laws, of_laws, noise_m)
+        evaluation, decided, judgement, last = _on_the_best((evaluation, decided, judgement, last), best, searched)
         if evaluation.adapt and judgement.of_all is not None:
-            kinds = fleet.found(laws, judgement.of_all, of_laws.among, evaluation.seed)
-            if kinds is None or kinds.column or _stand_out(laws, of_laws, floor["horizon_rmse_m"]):
+            kinds = fleet.found(laws, judgement.of_all, of_laws.among, seed)
+            if kinds is None or kinds.column or _stand_out(laws, of_laws, noise_m, two=True):
                 judgement = judgement.split(kinds)
     null, prepared, problem = decided.null, evaluation.records, evaluation.searching.problem
     first, before = evaluation.of_null
     final = judgement.compared if judgement.added and judgement.compared is not None else null
     everywhere = judge.windowed(prepared, problem, final)
     if not judgement.is_exact(least):
-        judgement = replace(judgement, shared=shared.find(places.respond(*everywhere), evaluation.seed))
+        judgement = replace(judgement, shared=shared.find(places.respond(*everywhere), seed))
     if evaluation.adapt and before is not None:
         pooled = evaluation.judged(null, pooled=True)[1]
         ladder = judgement.climbed(prepared, pooled, floor["horizon_rmse_m"])
         if not (judgement.added or judgement.law or judgement.fleet or judgement.is_exact(least)):
             leading = decided.rounds[0].leading
-            noisy, agree = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
+            noisy, agree = replica.agreement(*everywhere, floor["horizon_rmse_m"], seed, leading)
             errors = replica.ahead(everywhere[0], everywhere[1].theta, noisy.model)
             uneven = float(np.sqrt(np.mean(errors**2)) / (1.48 * np.median(np.abs(errors)) + 1e-9))
             ladder = replace(
@@ -129,35 +129,41 @@ def finished(
     # The model of the verdict first, beside the law that was to be completed.
     rolls = {f: roll(models[f], speed) for f in ("model.yaml", "model_idm.yaml") if f in models}
     result = replace(result, rolled={file: one for file, one in rolls.items() if one is not None})
-    shown = null if judgement.compared is None else judgement.compared
+    shown = judgement.compared or null
     return Discovery(result, models, prepared, null, shown, problem, decided.rounds, judgement)
 
 
-def _stand_out(laws: list[bases.Law], of_laws: Evaluation, noise_m: float) -> bool:
-    """Tell whether two laws for drivers gain more than where all have the null's, with their own residuals."""
+def best_beyond_noise(laws: list[bases.Law], of_laws: Evaluation, noise_m: float) -> bases.Law:
+    """Return the best law, or the null where drivers who follow that would prefer the other by their noise alone."""
+    null, best = laws[0], bases.best_of(laws)
+    held = best is null or not of_laws.adapt or _stand_out([null, best], of_laws, noise_m, two=False)
+    return best if held else null
+
+
+def _stand_out(laws: list[bases.Law], of_laws: Evaluation, noise_m: float, two: bool) -> bool:
+    """Tell whether the last law, or ``two`` for drivers, gain more than where all have the null's and own residuals."""
     problem, null = judge.windowed(of_laws.records, of_laws.searching.problem, of_laws.null)
-    return replica.stands_out(problem, null, noise_m, of_laws.seed, fleet.gain_of_two(laws, null.values))
+    return replica.stands_out(problem, null, noise_m, of_laws.seed, fleet.gain_of(laws, null.values, two))
 
 
 Found = tuple[Evaluation, Decided, Judgement, Solution]
 
 
-def _on_the_best(before: Found, laws: list[bases.Law], searched: Searched) -> Found:
+def _on_the_best(before: Found, best: bases.Law, searched: Searched) -> Found:
     """Return what is found on the best law where that is another one, if it is better than all that was found before.
 
     It has to hold by the rules of every addition, against its law, and against the law or IDM with what was added. On a
     law that errs more than IDM with what was added, nothing is sought.
     """
     evaluation, decided, judgement, last = before
-    best = bases.best_of(laws)
     now = judgement.beside(best)
     few = judgement.refusal is not None and judgement.refusal.reason is Reason.FEW_RUNS
     # A law with all candidates as its drivers' own strengths leaves nothing to try.
     search, own = evaluation.searching, best.model.catalogue
     has_candidates = search.located or not set(search.names) <= set(own.personal)
-    if not best.against or few or not has_candidates or not evaluation.adapt or now.of_all is None:
-        return evaluation, decided, now, last
-    if now.added and improves(compare(best.errors, now.of_all, evaluation.seed)):
+    if not best.against or few or not has_candidates or not evaluation.adapt or now.of_all is None or (
+        now.added and improves(compare(best.errors, now.of_all, evaluation.seed))
+    ):  # fmt: skip
         return evaluation, decided, now, last
     # In a law's loop there is room for all candidates.
     room = search.base.catalogue

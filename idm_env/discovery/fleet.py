@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from idm_env.discovery import crossed, judge, result
-from idm_env.discovery.bases import LEAST, Law
+from idm_env.discovery.bases import LEAST, Law, lowers
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.compare import ERRORS, Comparison, changes, compare
 from idm_env.discovery.crossed import in_blocks
@@ -16,7 +16,6 @@ from idm_env.discovery.judge import Judged
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import windows
 from idm_env.discovery.solve import Problem
-from idm_env.discovery.verdict import improves, mean_ratio
 
 COLUMNS = ("vehicle_class", "acc_run", "driver", "kind")
 """Columns that may say of what kind a driver is, in the order in which they are asked."""
@@ -89,18 +88,13 @@ def found(laws: Iterable[Law], one: Judged, among: Among, seed: int) -> Kinds | 
             continue
         own = _of_kinds(fair, which, among)
         against = compare(one, own, seed)
-        if not (_is_better(against) and _is_better(compare(_of_kinds(fair, which, among, null=True), own, seed))):
+        if not (lowers(against) and lowers(compare(_of_kinds(fair, which, among, null=True), own, seed))):
             continue
         sure = (which[0] == which[1]) & np.isin(which[0], each)
         group = np.where(sure, np.searchsorted(each, which[0]), logs.sum(1)[each].argmin(0))
         classes = () if kind is None else tuple(tuple(np.unique(kind[group == g])) for g in range(len(each)))
         return Kinds([fair[i] for i in each], group, own, one, against, column, classes, int(sure.sum()))
     return None
-
-
-def _is_better(against: Mapping[str, Comparison]) -> bool:
-    """Tell whether errors hold as those of an addition must, and are lower by ``LEAST``."""
-    return improves(against) and mean_ratio(against) < 1.0 - LEAST
 
 
 def _by_kind(logs: np.ndarray, kind: np.ndarray) -> np.ndarray:
@@ -138,12 +132,13 @@ def _whole(laws: Iterable[Law]) -> list[Law]:
     return [law for law in laws if not (law.own or law.model.catalogue.without)]
 
 
-def gain_of_two(laws: Iterable[Law], values: np.ndarray) -> Callable[[Problem], float]:
-    """Return a statistic of windows: the fall of log RMSE 5 s ahead by two laws, one a driver, beside one for all.
+def gain_of(laws: Sequence[Law], values: np.ndarray, two: bool) -> Callable[[Problem], float]:
+    """Return a statistic of windows: the fall of log RMSE 5 s ahead by the last law beside the first.
 
-    Every half of a driver's blocks is predicted by what the other half says. φ is ``values`` [Q].
+    Of ``two`` laws, one a driver, that beside the best one for all. Every half of a driver's blocks is predicted by
+    what the other half says. φ is ``values`` [Q].
     """
-    models = [law.model for law in _whole(laws)]
+    models = [law.model for law in (_whole(laws) if two else laws)]
 
     def logs(problem: Problem, model: Hypothesis) -> np.ndarray:
         rows, own = problem.rows, replace(problem, prior=first_prior(model.catalogue.own))
@@ -157,7 +152,8 @@ def gain_of_two(laws: Iterable[Law], values: np.ndarray) -> Callable[[Problem], 
 
     def gain(problem: Problem) -> float:
         every = np.stack([logs(problem, model) for model in models])
-        return float(every.mean((1, 2)).min() - _best_pair(every)[1])
+        mean = every.mean((1, 2))
+        return float(mean.min() - _best_pair(every)[1]) if two else float(mean[0] - mean[-1])
 
     return gain
 

@@ -80,7 +80,7 @@ class NoisyDrivers:
             pushed[first:end] = self._noise(records, r, random)
         rows = whole(driven, longest_s=np.inf, every_s=0.0)
         pulse = np.array([[1.0, 0.0, rows.steps, 1.0]])
-        problem = Problem(rows, None, _no_prior(self.theta))
+        problem = Problem(rows, None, Population(self.theta.mean(0), np.ones(self.theta.shape[-1])))
         gap, speed = (x[0][rows.valid] for x in problem.predict(self.theta[None], self.model, EMPTY, pulse))
         samples = rows.samples[rows.valid]
         moved = driven.column("lead_rear")[samples] - gap - driven.column("position")[samples]
@@ -104,7 +104,7 @@ def drivers_of(
     speed if the scene then tells as much of the errors' ``sizes``.
     """
     model, rows = solution.model.fixed(solution.values), problem.rows
-    error, sigma = ahead(problem, solution.theta, model), FIRST_SIGMA * _shares(rows, model, solution.theta)
+    error, sigma = ahead(problem, solution.theta, model), FIRST_SIGMA * _shares(problem, model, solution.theta)
 
     def mean_share(name: str, drivers: NoisyDrivers) -> float:
         random = np.random.default_rng(1)
@@ -148,7 +148,7 @@ def _own_noise(problem: Problem, solution: Solution, drivers: NoisyDrivers, nois
     """Return drivers whose noise is what they do beside the model, in means of a second."""
     records, theta = problem.rows.records, solution.theta
     rows = windows(records, 1.0)
-    speed = Problem(rows, None, _no_prior(theta)).predict(theta[None], drivers.model, EMPTY)[1][0, :, -1]
+    speed = Problem(rows, None, problem.prior).predict(theta[None], drivers.model, EMPTY)[1][0, :, -1]
     residual = (records.speed[rows.samples[:, -1]] - speed) / (rows.steps * records.dt)
     # Of a group without a window nothing is known.
     each = (residual[rows.group == g] for g in range(len(theta)))
@@ -184,9 +184,9 @@ def ahead(problem: Problem, theta: np.ndarray, model: Hypothesis) -> np.ndarray:
     return errors
 
 
-def _shares(rows: Rows, model: Hypothesis, theta: np.ndarray) -> np.ndarray:
+def _shares(problem: Problem, model: Hypothesis, theta: np.ndarray) -> np.ndarray:
     """Return every driver's root mean square of increments of the speed's error over the median one [G]."""
-    speed = Problem(rows, None, _no_prior(theta)).predict(theta[None], model, EMPTY)[1][0]
+    rows, speed = problem.rows, problem.predict(theta[None], model, EMPTY)[1][0]
     own = np.mean(np.diff(speed - rows.records.speed[rows.samples], axis=1, prepend=0.0) ** 2, axis=1)
     square = np.bincount(rows.group, own, len(theta)) / np.maximum(np.bincount(rows.group, minlength=len(theta)), 1)
     return np.asarray(np.sqrt(square / np.median(square[square > 0.0])))
@@ -259,7 +259,3 @@ def agreement(
     if claims := [name for name in ("scene", *leading) if agree[name].is_refused]:
         agree |= likenesses(_own_noise(problem, solution, gaussian, noise_m), claims, claims)
     return gaussian, agree
-
-
-def _no_prior(theta: np.ndarray) -> Population:
-    return Population(theta.mean(0), np.ones(theta.shape[-1]))

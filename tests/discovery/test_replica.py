@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks import undeclared
 from idm_env.data import Trajectories, episodes, hidden, synthetic
-from idm_env.discovery import fleet, judge, replica
+from idm_env.discovery import finish, fleet, judge, replica
 from idm_env.discovery.bases import Law
 from idm_env.discovery.calibrate import first_prior
+from idm_env.discovery.compare import Comparison
 from idm_env.discovery.ladder import FORESEEN, LEVEL
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis, curve, simple
@@ -82,8 +84,29 @@ def test_kinds_of_drivers_gain_more_than_their_noise_alone(
     problem, found = fitted_to(synthetic.generate(31, runs=8, followers=2, seconds=90.0, ou=0.1)[0])
     models = [Hypothesis((), Catalogue((), base_named(name), located=False)) for name in ("idm", "constant_time_gap")]
     laws = [Law(model.catalogue.base, model, None, {}) for model in models]  # type: ignore[arg-type]
-    gain = fleet.gain_of_two(laws, found.values)
+    gain = fleet.gain_of(laws, found.values, two=True)
     assert replica.stands_out(problem, found, floor_of(problem), 0, gain) is mixed
+
+
+@pytest.mark.parametrize(("name", "true"), [("idm_plus", False), ("constant_time_gap", True)])
+def test_a_law_is_better_only_where_it_gains_more_than_drivers_noise_alone(
+    name: str, true: bool, kinds: Mixing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Drivers of IDM with much noise, 0.7 m/s², are predicted better by IDM+; linear controllers by their own law."""
+    kinds(np.full((8, 2), true))
+    monkeypatch.setattr(replica, "FEW", 5 if true else 19)
+    problem, found = fitted_to(synthetic.generate(31, runs=8, followers=2, seconds=90.0, ou=0.1 if true else 0.7)[0])
+    models = [Hypothesis((), Catalogue((), base_named(one), located=False)) for one in ("idm", name)]
+    falls = {"horizon_rmse_m": Comparison(1.0, 0.9, 0.9, 0.85, 0.95)}
+    null, law = (
+        Law(m.catalogue.base, m, None, against)  # type: ignore[arg-type]
+        for m, against in zip(models, ({}, falls), strict=True)
+    )
+    searching = SimpleNamespace(problem=problem)
+    of_laws = SimpleNamespace(records=problem.rows.records, searching=searching, null=found, adapt=True, seed=0)
+    assert law.is_better and fleet.gain_of([null, law], found.values, two=False)(problem) > 0.0
+    told = finish.best_beyond_noise([null, law], of_laws, floor_of(problem))  # type: ignore[arg-type]
+    assert told is (law if true else null)
 
 
 def test_noise_gains_a_candidate_as_much_in_replicas() -> None:
