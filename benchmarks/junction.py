@@ -1,7 +1,7 @@
 """Vehicles at a junction as agents: ``python -m benchmarks.junction [--network crossing]``, rules beside PPO.
 
 Delay is the time that vehicles lose, those who wait to enter included, per vehicle that was due (s), over fresh
-episodes; ± is 95 % of the paired difference to *human*: nobody holds back. Rows:
+episodes; ± is 95 % of the paired difference to *human*: nobody holds back, and to *searched*. Rows:
 
 * *random* actions, and *constant* ones: all agents hold back a little, all the time;
 * *polite*: whoever goes first brakes 10 to 40 m before his line while foes stand before theirs;
@@ -12,14 +12,13 @@ episodes; ± is 95 % of the paired difference to *human*: nobody holds back. Row
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks import command, table
-from benchmarks.bench.measure import machine
-from benchmarks.signals import FRESH, OTHERS, Policy, delays, interval, made, trained
+from benchmarks import command
+from benchmarks.bench.search import cross_entropy
+from benchmarks.signals import OTHERS, Policy, Row, delays, learners, made, print_delays, trained
 from idm_env.tasks.junction import FEATURES
 
 PPO: dict[str, Any] = {"n_steps": 64, "batch_size": 512, "n_epochs": 5, "gamma": 0.97}
@@ -51,17 +50,18 @@ def polite(env: Any, seen: np.ndarray) -> np.ndarray:
 
 def searched(seconds: float, **keywords: Any) -> tuple[np.ndarray, float]:
     """Return the weights of a cross-entropy search, which judges each by four worlds' delay, and its CPU time (s)."""
-    rows, each, keep, random, start = 32, 4, 6, np.random.default_rng(0), time.process_time()
-    mean, width, env, turn = np.zeros(len(WEIGHED)), np.full(len(WEIGHED), 0.5), made(32 * 4, **keywords), 0
-    while time.process_time() - start < seconds:
-        weights = mean + width * random.standard_normal((rows, len(WEIGHED)))
+    rows, each = 32, 4
+    env = made(rows * each, **keywords)
+
+    def costs(weights: np.ndarray, turn: int) -> np.ndarray:
         # Two worlds of one seed would not differ: every candidate has episodes of its own.
-        lost = (
-            delays(env, weighed(np.repeat(weights, each, 0)), OTHERS + turn * rows * each).reshape(rows, each).mean(1)
-        )
-        best = weights[lost.argsort()[:keep]]
-        mean, width, turn = 0.5 * mean + 0.5 * best.mean(0), 0.5 * width + 0.5 * (best.std(0) + 0.03), turn + 1
-    return mean, time.process_time() - start
+        lost = delays(env, weighed(np.repeat(weights, each, 0)), OTHERS + turn * rows * each)
+        return lost.reshape(rows, each).mean(1)
+
+    mean, width = np.zeros(len(WEIGHED)), np.full(len(WEIGHED), 0.5)
+    options: dict[str, Any] = {"rows": rows, "keep": 6, "floor": 0.03, "inertia": 0.5, "seconds": seconds}
+    weights, _, spent = cross_entropy(costs, mean, width, **options)
+    return weights, spent
 
 
 def main(
@@ -70,31 +70,17 @@ def main(
 ) -> None:  # fmt: skip
     """Delay per vehicle of rules and of PPO, on the same fresh episodes."""
     keywords: dict[str, Any] = {"task": "junction", "network": network, "inflow": inflow, "agents": agents}
-    about, random = machine(), np.random.default_rng(0)
-    print(f"Delay per vehicle, {network}, {inflow:g} veh/h an entry ({about['processor']}, {about['date']})\n")
+    random = np.random.default_rng(0)
     held = lambda x: lambda env, seen: np.full((len(seen), agents), x)  # noqa: E731
-    rows: list[tuple[str, Policy, float]] = [
-        ("human", lambda env, seen: None, 0.0),
-        ("random", lambda env, seen: random.uniform(-1.0, 1.0, (len(seen), agents)), 0.0),
-        *((f"constant {x}", held(x), 0.0) for x in (-0.1, -0.3)),
-        ("polite", polite, 0.0),
+    rows: list[Row] = [
+        ("human", lambda env, seen: None, 0.0, {}),
+        ("random", lambda env, seen: random.uniform(-1.0, 1.0, (len(seen), agents)), 0.0, {}),
+        *((f"constant {x}", held(x), 0.0, {}) for x in (-0.1, -0.3)),
+        ("polite", polite, 0.0, {}),
     ]
-    if search_seconds > 0:
-        weights, seconds = searched(search_seconds, **keywords)
-        rows.append((f"searched {np.round(weights, 2).tolist()}", weighed(weights), seconds))
-    for seed in range(seeds):
-        policy, seconds = trained(seed, steps, PPO, **keywords)
-        rows.append((f"PPO, seed {seed}", policy, seconds))
-    cells, other = [], None
-    for name, policy, seconds in rows:
-        env, start = made(episodes, **keywords), time.process_time()
-        each = delays(env, policy, FRESH)
-        speed = episodes * env.task.horizon / (time.process_time() - start)
-        other = each if other is None else other
-        cells.append([name, f"{each.mean():.1f}", interval(each - other), f"{seconds:.0f}", f"{speed:.0f}"])
-        print(*cells[-1], flush=True)
-    print()
-    print(table(["", "delay (s)", "beside human", "CPU s", "env steps per CPU s"], cells))
+    search = (lambda: searched(search_seconds, **keywords)) if search_seconds > 0 else None
+    rows += learners(search, weighed, seeds, lambda seed: trained(seed, steps, PPO, **keywords))
+    print_delays(rows, episodes, keywords)
 
 
 if __name__ == "__main__":

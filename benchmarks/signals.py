@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
@@ -34,6 +34,7 @@ import idm_env  # noqa: F401 (registers the environments)
 from benchmarks import command, table
 from benchmarks.bench.measure import machine
 from benchmarks.bench.peers import started
+from benchmarks.bench.search import cross_entropy
 from benchmarks.networks import GRID, generated, network_of, routes_xml
 from idm_env.envs.network_faces import NetworkVectorEnv
 from idm_env.multilane.junctions import by_link, journeys_of
@@ -47,6 +48,8 @@ PPO: dict[str, Any] = {
 }  # fmt: skip
 """What PPO is given beside SB3's defaults; its learning rate falls from 1e-3. A step is 5 s: γ looks 100 s ahead."""
 Policy = Callable[[NetworkVectorEnv, np.ndarray], Any]
+Row = tuple[str, Policy, float, dict[str, Any]]
+"""A name, a policy, the CPU time that it took to find (s), and keywords of its own."""
 
 
 def made(count: int, **keywords: Any) -> NetworkVectorEnv:
@@ -107,14 +110,15 @@ def weighed(weights: Any) -> Policy:
 
 def searched(seconds: float, **keywords: Any) -> tuple[np.ndarray, float]:
     """Return the weights of a cross-entropy search, which judges each by a world's delay, and its CPU time (s)."""
-    rows, keep, random, start = 48, 8, np.random.default_rng(0), time.process_time()
-    mean, width, env, turn = np.array([0.5, 0.5, 0.5, 1.0]), np.array([0.5, 0.5, 0.5, 2.0]), made(rows, **keywords), 0
-    while time.process_time() - start < seconds:
-        weights = mean + width * random.standard_normal((rows, 4))
+    env = made(48, **keywords)
+
+    def costs(weights: np.ndarray, turn: int) -> np.ndarray:
         # Two worlds of one seed would not differ: every candidate has an episode of its own.
-        best = weights[delays(env, weighed(weights), OTHERS + turn * rows).argsort()[:keep]]
-        mean, width, turn = best.mean(0), best.std(0) + 0.05, turn + 1
-    return mean, time.process_time() - start
+        return delays(env, weighed(weights), OTHERS + turn * len(weights))
+
+    mean, width = np.array([0.5, 0.5, 0.5, 1.0]), np.array([0.5, 0.5, 0.5, 2.0])
+    weights, _, spent = cross_entropy(costs, mean, width, rows=48, keep=8, floor=0.05, seconds=seconds)
+    return weights, spent
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -225,13 +229,12 @@ def main(
     keywords: dict[str, Any] = {"network": network, "inflow": inflow}
     if sumo and network != "grid 5x5":
         raise SystemExit(f"--sumo {sumo} drives netgenerate's grid, and not '{network}'. Use --network 'grid 5x5'.")
-    about, random = machine(), np.random.default_rng(0)
-    print(f"Delay per vehicle, {network}, {inflow:g} veh/h an entry ({about['processor']}, {about['date']})\n")
+    random = np.random.default_rng(0)
     never: Policy = lambda env, seen: None  # noqa: E731
     chance: Policy = lambda env, seen: random.integers(0, env.task.counts, (env.worlds.count, len(env.task.agents)))  # noqa: E731
     first: Policy = lambda env, seen: np.zeros((env.worlds.count, len(env.task.agents)), int)  # noqa: E731
     pressure = weighed([1.0, 0.0, 1.0, 0.0])
-    rows: list[tuple[str, Policy, float, dict[str, Any]]] = [
+    rows: list[Row] = [
         ("max pressure 10", pressure, 0.0, {}),
         ("fixed", never, 0.0, {}),
         ("random", chance, 0.0, {}),
@@ -240,19 +243,33 @@ def main(
         ("max pressure 5", pressure, 0.0, {"least_green": 5.0}),
         ("max pressure 15", pressure, 0.0, {"least_green": 15.0}),
     ]
-    if search_seconds > 0:
-        weights, seconds = searched(search_seconds, **keywords)
-        rows.append((f"searched {np.round(weights, 2).tolist()}", weighed(weights), seconds, {}))
+    search = (lambda: searched(search_seconds, **keywords)) if search_seconds > 0 else None
+    rows += learners(search, weighed, seeds, lambda seed: trained(seed, steps, **keywords))
+    print_delays(rows, episodes, keywords, sumo)
+
+
+def learners(search: Any, rule: Callable[[Any], Policy], seeds: int, train: Callable[[int], Any]) -> Iterator[Row]:
+    """Yield the rows of the rule that a ``search`` finds, if there is one, and of PPO with some seeds."""
+    if search:
+        weights, seconds = search()
+        yield f"searched {np.round(weights, 2).tolist()}", rule(weights), seconds, {}
     for seed in range(seeds):
-        policy, seconds = trained(seed, steps, **keywords)
-        rows.append((f"PPO, seed {seed}", policy, seconds, {}))
+        yield f"PPO, seed {seed}", *train(seed), {}
+
+
+def print_delays(rows: Sequence[Row], episodes: int, keywords: dict[str, Any], sumo: int = 0) -> None:
+    """Print the delays of rows in fresh episodes, beside those of the first row and of a searched rule."""
+    about, demand = machine(), f"{keywords['network']}, {keywords['inflow']:g} veh/h an entry"
+    print(f"Delay per vehicle, {demand} ({about['processor']}, {about['date']})\n")
     cells, other, rule = [], None, None
     for name, policy, seconds, more in rows:
-        each = delays(made(episodes, **{**keywords, **more}), policy, FRESH)
+        env, start = made(episodes, **{**keywords, **more}), time.process_time()
+        each = delays(env, policy, FRESH)
+        speed = episodes * env.task.horizon / (time.process_time() - start)
         other = each if other is None else other
         rule = each if name.startswith("searched") else rule
         cells.append([name, f"{each.mean():.1f}", interval(each - other)])
-        cells[-1] += ["" if rule is None else interval(each - rule), f"{seconds:.0f}"]
+        cells[-1] += ["" if rule is None else interval(each - rule), f"{seconds:.0f}", f"{speed:.0f}"]
         if sumo and ("PPO" not in name or name.endswith(" 0")):
             theirs = in_sumo(sumo, policy, {**keywords, **more})
             cells[-1] += [f"{theirs.mean():.1f}", interval(theirs - each[:sumo])]
@@ -260,7 +277,7 @@ def main(
             cells[-1] += ["", ""]
         print(*cells[-1], flush=True)
     print()
-    head = ["", "delay (s)", "beside max pressure 10", "beside searched", "CPU s"]
+    head = ["", "delay (s)", f"beside {rows[0][0]}", "beside searched", "CPU s", "env steps per CPU s"]
     print(table(head + ["in SUMO", "less ours"] * bool(sumo), cells))
 
 

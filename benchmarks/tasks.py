@@ -37,6 +37,7 @@ import tyro
 
 import idm_env  # noqa: F401 (registers the environments)
 from benchmarks import command, named_rows, table
+from benchmarks.bench.search import cross_entropy
 from idm_env.envs.batch import Batch
 from idm_env.envs.settings import settings
 from idm_env.jobs.progress import OnProgress
@@ -169,20 +170,18 @@ def paid(task: str, rules: np.ndarray, seeds: Sequence[int]) -> np.ndarray:
 
 def searched(task: str) -> np.ndarray:
     """Return the rule with the best mean return, by the cross-entropy method over the logarithms of its numbers."""
-    drawing = np.random.default_rng(0)
     low, high = np.log(RANGES).T
-    middle, spread = (low + high) / 2.0, (high - low) / 2.0
     count, each = (RULES // 2, 16) if task in OPEN else (RULES, 4)
 
     def mean(rules: np.ndarray, first: int, episodes: int) -> np.ndarray:
         pays = paid(task, rules.repeat(episodes, 0), [*range(first, first + episodes)] * len(rules))
         return pays.reshape(len(rules), -1).mean(1)
 
-    for generation in range(GENERATIONS):
-        rules = (middle + spread * drawing.standard_normal((count, len(RANGES)))).clip(low, high)
-        rules[0] = middle
-        best = rules[np.argsort(mean(rules, OTHERS + 100 + each * generation, each))[-count // 4 :]]
-        middle, spread = best.mean(0), best.std(0) + 0.05 * (high - low)
+    middle, best, _ = cross_entropy(
+        lambda rules, generation: -mean(rules, OTHERS + 100 + each * generation, each), (low + high) / 2.0,
+        (high - low) / 2.0, rows=count, keep=count // 4, floor=0.05 * (high - low), ends=(low, high), with_mean=True,
+        generations=GENERATIONS,
+    )  # fmt: skip
     best = np.concatenate((best, middle[None]))
     return np.exp(best[int(mean(best, OTHERS + 200, 4 * each).argmax())])
 

@@ -6,11 +6,13 @@ import importlib
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
 
 from benchmarks import command, kept_rows, lane_planner, lane_search, lane_tasks, lanes, named_rows, tasks
+from benchmarks.bench.search import cross_entropy
 from idm_env.jobs.progress import OnProgress
 from idm_env.jobs.workers import Workers
 from idm_env.tasks import make_task
@@ -26,6 +28,24 @@ def test_every_live_benchmark_is_a_command_that_says_its_options(
     with pytest.raises(SystemExit, match="0"):
         command(importlib.import_module(f"benchmarks.{name}").main)
     assert capsys.readouterr().out.startswith(f"usage: python -m benchmarks.{name} ")
+
+
+def test_a_cross_entropy_search_finds_the_least_cost_within_its_ends() -> None:
+    """Of a parabola; beyond an end it is the end, and with no generation the mean it began with."""
+    drawn: list[np.ndarray] = []
+
+    def costs(numbers: np.ndarray, generation: int) -> np.ndarray:
+        assert generation == len(drawn)
+        drawn.append(numbers)
+        return ((numbers - np.array([1.5, 9.0])) ** 2).sum(1)
+
+    options = {"rows": 40, "keep": 8, "floor": 0.01, "ends": (-3.0, 3.0), "with_mean": True}
+    mean, best, _ = cross_entropy(costs, np.zeros(2), np.ones(2), generations=25, **options)
+    np.testing.assert_allclose(mean, [1.5, 3.0], atol=0.02)
+    assert best.shape == (8, 2) and len(drawn) == 25
+    assert max(np.abs(numbers).max() for numbers in drawn) == 3.0
+    np.testing.assert_array_equal(drawn[0][0], [0.0, 0.0])
+    np.testing.assert_array_equal(cross_entropy(costs, np.ones(2), 1.0, generations=0, **options)[0], [1.0, 1.0])
 
 
 def _squared(part: int, on_progress: OnProgress) -> int:

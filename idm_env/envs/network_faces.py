@@ -91,10 +91,11 @@ def _info(outcome: NetworkStep) -> dict[str, np.ndarray]:
 
 
 class NetworkVectorEnv(VectorEnv):
-    """``gym.make_vec("DiffIDM-v0", num_envs=64, task="signals", network="grid 5x5")``; keywords: those of the task.
+    """Signals or vehicles of a network as agents; keywords: ``task``, ``"signals"`` or ``"junction"``, and those of it.
 
     A world's agents are one joint agent: observations one after the other, an action for each, the mean of rewards.
-    With ``shared`` every agent of every world is an environment of its own, as one policy for all needs: ``num_envs``
+    Signals choose phases, vehicles numbers from −1 (brake) to 1; see ``SignalsTask`` and ``JunctionTask``. With
+    ``shared`` every agent of every world is an environment of its own, as one policy for all needs: ``num_envs``
     times agents rows. Worlds reset within the step that ends them (``"SameStep"``). ``step(None)`` leaves signals to
     their plans, and vehicles to their drivers. Infos tell, of each world, vehicles ``inside``, ``waiting``,
     ``halting`` and ``arrived``, and the time ``lost`` in the step (s).
@@ -155,7 +156,7 @@ class NetworkVectorEnv(VectorEnv):
 
 
 class NetworkEnv(gymnasium.Env):
-    """One world: ``gym.make("DiffIDM-v0", task="signals")``; as a row of ``NetworkVectorEnv``."""
+    """One world: ``gym.make("DiffIDM-v0", task="signals")`` or ``"junction"``; as a row of ``NetworkVectorEnv``."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
 
@@ -180,7 +181,7 @@ class NetworkEnv(gymnasium.Env):
 
 
 class network_parallel_env(ParallelEnv[str, np.ndarray, Any]):  # noqa: N801  (as PettingZoo names environments)
-    """PettingZoo: every signal, by its name, or vehicle is an agent; ``parallel_env(task="signals")``."""
+    """PettingZoo: an agent is a signal, by its name, in task ``"signals"``, a vehicle's slot in ``"junction"``."""
 
     metadata: dict[str, Any] = {"name": "diffidm_networks_v0", "is_parallelizable": True, "render_modes": []}  # noqa: RUF012
 
