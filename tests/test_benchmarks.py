@@ -39,9 +39,9 @@ def test_a_cross_entropy_search_finds_the_least_cost_within_its_ends() -> None:
         drawn.append(numbers)
         return ((numbers - np.array([1.5, 9.0])) ** 2).sum(1)
 
-    options = {"rows": 40, "keep": 8, "floor": 0.01, "ends": (-3.0, 3.0), "with_mean": True}
+    options = {"rows": 40, "keep": 8, "floor": 0.1, "ends": (-3.0, 3.0), "with_mean": True}
     mean, best, _ = cross_entropy(costs, np.zeros(2), np.ones(2), generations=25, **options)
-    np.testing.assert_allclose(mean, [1.5, 3.0], atol=0.02)
+    np.testing.assert_allclose(mean, [1.5, 3.0], atol=0.1)
     assert best.shape == (8, 2) and len(drawn) == 25
     assert max(np.abs(numbers).max() for numbers in drawn) == 3.0
     np.testing.assert_array_equal(drawn[0][0], [0.0, 0.0])
