@@ -114,16 +114,12 @@ class NetworkVectorEnv(VectorEnv):
         self.task, agents = self.worlds.task, len(self.worlds.task.names)
         self._shared, self._each = shared, agents if shared else 1
         self.num_envs = num_envs * self._each
-        self._wide = self.task.features * (1 if shared else agents)
-        self.single_observation_space = Box(0.0, 1.0, (self._wide,), np.float32)
+        wide = self.task.features * (1 if shared else agents)
+        self.single_observation_space = Box(0.0, 1.0, (wide,), np.float32)
         most = 1 if self.task.counts is None else self.task.counts.max()
         self.single_action_space = _actions(self.task, most if shared else None)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-
-    def _rows(self, x: np.ndarray) -> np.ndarray:
-        """Return the observation of every row."""
-        return x.reshape(self.num_envs, self._wide)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -139,18 +135,18 @@ class NetworkVectorEnv(VectorEnv):
         elif seed is not None or self.worlds.world is None:
             super().reset(seed=None if seed is None else whole("seed", seed, 0))
             self.worlds.seed([int(self.np_random_seed or 0) + i for i in range(self.worlds.count)])
-        return self._rows(self.worlds.begin(options)), {}
+        return self.worlds.begin(options).reshape(self.num_envs, -1), {}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all worlds by ``hold`` seconds with actions ``[n]`` or ``[n, S]``; ValueError for what is none."""
         seen, outcome, over = self.worlds.step(actions, self.action_space.shape or ())
         reward = outcome.reward.reshape(-1) if self._shared else outcome.reward.mean(1)
-        rows = self._rows(seen)
+        rows = seen.reshape(self.num_envs, -1)
         info: dict[str, Any] = {name: np.repeat(x, self._each) for name, x in _info(outcome).items()}
         info |= {f"_{name}": np.full(self.num_envs, True) for name in info}
         ends = np.full(self.num_envs, over)
         if over:
-            last, rows = rows, self._rows(self.worlds.begin())
+            last, rows = rows, self.worlds.begin().reshape(rows.shape)
             info = {"final_obs": last, "final_info": info, "_final_obs": ends, "_final_info": ends}
         return rows, reward, np.zeros(self.num_envs, bool), ends, info
 

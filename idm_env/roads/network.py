@@ -215,11 +215,9 @@ class Network(Road):
     @cached_property
     def move_of(self) -> Array:
         """The move that each inner link is a part of (L), −1 outside junctions."""
-        moves = np.full(len(self.names), NONE, np.int32)
-        for column in self.path.T:
-            some = column >= 0
-            moves[column[some]] = np.flatnonzero(some)
-        return moves
+        moves = np.full(len(self.names) + 1, NONE, np.int32)
+        moves[self.path] = np.arange(len(self.path))[:, None]
+        return moves[:-1]
 
     @cached_property
     def follows(self) -> Array:

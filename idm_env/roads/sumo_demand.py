@@ -156,8 +156,6 @@ class _Reader:
             speed = self._entry_speed(element, self.kinds[one[0]]["idm.desired_speed"], self.limit[route[0]], random)
             kind = self._driver(one[0], round(_draw_share(one[2], shares), 3))
             self.rows.append((self.numbers.setdefault(route, len(self.numbers)), depart, speed, one[1], kind))
-            if len(self.rows) > MOST_VEHICLES:
-                raise ValueError(f"{name(element)} brings more than {MOST_VEHICLES} vehicles. Give it fewer.")
 
     def _driver(self, kind: int, factor: float) -> int:
         """Return the row of ``kinds`` of those who are of a kind and drive a share of limits."""
@@ -205,7 +203,7 @@ class _Reader:
         else:
             period = (end - begin) / max(most, 1.0)
         count = min(most, (end - begin) / period - 1e-9) if end > begin else 0.0
-        if count > MOST_VEHICLES:
+        if len(self.rows) + count > MOST_VEHICLES:
             raise ValueError(f"{name(element)} brings more than {MOST_VEHICLES} vehicles. Give it fewer.")
         if match:
             times = arrivals(1.0 / period, begin, end, random)

@@ -5,6 +5,7 @@ import os
 import re
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -57,17 +58,11 @@ def number(element: Element, key: str, default: float | None = None, low: float 
     if default is not None and key not in element.attrib:
         return default
     value = text(element, key)
-    try:
-        return _bounded(float(value), low, above)
-    except ValueError:
-        rule = "" if low < -1e11 else f" {'above' if above else 'of at least'} {low:g}"
-        raise ValueError(f"{name(element)}: {key} = {validation.shown(value)} must be a number{rule}.") from None
-
-
-def _bounded(value: float, low: float, above: bool) -> float:
-    if not low <= value < 1e12 or (above and value == low):
-        raise ValueError
-    return value
+    with suppress(ValueError):
+        if low <= (x := float(value)) < 1e12 and not (above and x == low):
+            return x
+    rule = "" if low < -1e11 else f" {'above' if above else 'of at least'} {low:g}"
+    raise ValueError(f"{name(element)}: {key} = {validation.shown(value)} must be a number{rule}.")
 
 
 def seconds(element: Element, key: str, default: float | None = None) -> float:
@@ -75,7 +70,5 @@ def seconds(element: Element, key: str, default: float | None = None) -> float:
     value = element.get(key, "")
     if not re.fullmatch(r"(\d+:)?\d+:\d+:\d+(\.\d*)?", value):
         return number(element, key, default, 0.0)
-    total = 0.0
-    for part, factor in zip(reversed(value.split(":")), (1.0, 60.0, 3600.0, 86400.0), strict=False):
-        total += factor * float(part)
-    return total
+    parts = zip(reversed(value.split(":")), (1.0, 60.0, 3600.0, 86400.0), strict=False)
+    return sum(factor * float(part) for part, factor in parts)

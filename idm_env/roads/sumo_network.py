@@ -6,6 +6,7 @@ Lengths in m, limits in m/s, times in s. Source: SUMO's documentation, *Networks
 """
 
 from collections import Counter
+from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
@@ -134,14 +135,13 @@ class _Reader:
                 if one not in foes[other]:
                     foes[other].append(one)
                     self.skipped["foes made mutual"] += 1
-        merging: dict[str, list[int]] = {}
-        for one, end in enumerate(ends):  # an unregulated junction has no foes
-            for other in merging.setdefault(end, []):
+        merging = sorted(range(len(ends)), key=ends.__getitem__)
+        for _, group in groupby(merging, ends.__getitem__):  # an unregulated junction has no foes
+            for one, other in combinations(group, 2):
                 if starts[other] != starts[one] and other not in foes[one]:
                     foes[one].append(other)
                     foes[other].append(one)
                     self.skipped["pairs of merging moves made foes"] += 1
-            merging[end].append(one)
         plans = [(signal, *self.signals[signal]) for signal in self.signals if signal in signals]
         self.skipped["signals without a move for cars"] += len(self.signals) - len(plans)
         moves = {"start": starts, "end": ends, "path": paths, "foes": foes, "yields": yields}
