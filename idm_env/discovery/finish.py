@@ -129,8 +129,7 @@ def finished(
     # The model of the verdict first, beside the law that was to be completed.
     rolls = {f: roll(models[f], speed) for f in ("model.yaml", "model_idm.yaml") if f in models}
     result = replace(result, rolled={file: one for file, one in rolls.items() if one is not None})
-    shown = judgement.compared or null
-    return Discovery(result, models, prepared, null, shown, problem, decided.rounds, judgement)
+    return Discovery(result, models, prepared, null, judgement.compared or null, problem, decided.rounds, judgement)
 
 
 def best_beyond_noise(laws: list[bases.Law], of_laws: Evaluation, noise_m: float) -> bases.Law:
@@ -217,7 +216,6 @@ def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) ->
     added.sort(key=lambda e: e.rank if e.hook == "adapt" else 0)
     seen = np.unique(prepared.group)
     middle = np.exp(np.median(theta[seen], axis=0))
-    law = final.model.catalogue.base
 
     def bounded(values: np.ndarray) -> dict[str, dict[str, float]]:
         by_effect: dict[str, dict[str, float]] = {}
@@ -227,7 +225,7 @@ def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) ->
 
     drivers = {prepared.groups[group]: bounded(np.exp(theta[group])) for group in seen}
     return SavedModel(
-        effects=(law, *added, Brakes()),
+        effects=(final.model.catalogue.base, *added, Brakes()),
         parameters={**numbers, **bounded(middle)},
         dt=prepared.dt,
         integration="midpoint",

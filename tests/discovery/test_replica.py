@@ -94,7 +94,7 @@ def test_a_law_is_better_only_where_it_gains_more_than_drivers_noise_alone(
 ) -> None:
     """Drivers of IDM with much noise, 0.7 m/s², are predicted better by IDM+; linear controllers by their own law."""
     kinds(np.full((8, 2), true))
-    monkeypatch.setattr(replica, "FEW", 5 if true else 19)
+    monkeypatch.setattr(replica, "FEW", 10 if true else 19)
     problem, found = fitted_to(synthetic.generate(31, runs=8, followers=2, seconds=90.0, ou=0.1 if true else 0.7)[0])
     models = [Hypothesis((), Catalogue((), base_named(one), located=False)) for one in ("idm", name)]
     falls = {"horizon_rmse_m": Comparison(1.0, 0.9, 0.9, 0.85, 0.95)}
@@ -107,6 +107,16 @@ def test_a_law_is_better_only_where_it_gains_more_than_drivers_noise_alone(
     assert law.is_better and fleet.gain_of([null, law], found.values, two=False)(problem) > 0.0
     told = finish.best_beyond_noise([null, law], of_laws, floor_of(problem))  # type: ignore[arg-type]
     assert told is (law if true else null)
+
+
+def test_what_lies_far_above_the_first_replicas_needs_no_more() -> None:
+    """Five are enough then; else one that gains as much ends it."""
+    problem, found = fitted(4, 0.1, runs=4, seconds=60.0)
+    first = [0.1, 0.2, 0.1, 0.2, 0.1]
+    for gains, told in (([9.0, *first], True), ([0.3, *first, 0.1, 0.4], False), ([0.3, *first, *[0.2] * 14], True)):
+        each = iter(gains)
+        assert replica.stands_out(problem, found, 0.05, 0, lambda _, each=each: next(each)) is told  # type: ignore[misc]
+        assert list(each) == [], "no replica fewer"
 
 
 def test_noise_gains_a_candidate_as_much_in_replicas() -> None:
