@@ -132,14 +132,13 @@ class _Traffic:
         links["mean_speed_mps"] = [s / n if n else None for s, n in zip(speed.tolist(), vehicles.tolist(), strict=True)]
         ways, dt = junctions.journeys_of(self.state), self.simulator.dt
         used = [row[row >= 0] for row in demand.routes]
-        free = network.times(demand.routes).sum(1)
         ends = (("from", 0), ("to", -1))
         trips: dict[str, Any] = {name: [network.edge[used[r][k]] for r in demand.route] for name, k in ends}
         trips["due_s"] = demand.depart
         for name, steps in (("entered_s", ways.entered), ("arrived_s", ways.left)):
             trips[name] = [k * dt if k >= 0 else None for k in steps.tolist()]
         trips["travel_time_s"] = junctions.travel_time(self.simulator, self.state).double().numpy()
-        trips["free_time_s"] = free[demand.route]
+        trips["free_time_s"] = network.times(demand.routes).sum(1)[demand.route]
         over_time = pl.DataFrame(self.periods, schema=COUNTS, orient="row")
         return dict(zip(TABLES, (pl.DataFrame(links), pl.DataFrame(trips), over_time), strict=True))
 

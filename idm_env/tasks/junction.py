@@ -98,6 +98,8 @@ class JunctionTask(NetworkTask):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not len(self.road.start):
+            raise ValueError(f"network = {shown(self.network)} has no junction. Give one that has.")
         if self.is_closed:
             self.leave_out(f"nobody arrives on network = {shown(self.network)}", "inflow", "turns", "randomise")
         else:

@@ -25,7 +25,7 @@ from idm_env.roads.network_demand import Demand, without_turns_back
 from idm_env.roads.ways import Ways, keyed
 from idm_env.simulator import Simulator
 from idm_env.tasks.behaviour import Behaviour, behaviour
-from idm_env.tasks.checks import Range, by_name, in_ranges, two_ends
+from idm_env.tasks.checks import Range, by_name, in_ranges, span
 from idm_env.tasks.random import Draw
 from idm_env.types import Journeys, State, mapped
 from idm_env.validation import nearest, one_of, shown
@@ -157,10 +157,8 @@ class NetworkTask:
     @cached_property
     def inflows(self) -> tuple[float, float]:
         """Least and most inflow of an episode (vehicles per hour and entry)."""
-        low, high = two_ends("randomise.inflow", (self.randomise or {}).get("inflow", (self.inflow,) * 2))
-        for end in (low, high):
-            NetworkTask.ranges["inflow"].check("randomise.inflow", end)
-        return low, high
+        inflow, limits = (self.randomise or {}).get("inflow", self.inflow), NetworkTask.ranges["inflow"]
+        return span("randomise.inflow", inflow, limits.low, limits.unit, limits.high)
 
     @cached_property
     def vehicles(self) -> int:

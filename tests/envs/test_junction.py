@@ -25,6 +25,9 @@ NETWORKS = ("crossing", "roundabout", "figure eight")
 SMALL: dict[str, Any] = {"duration": 60.0, "inflow": 600.0, "agents": 4}
 EIGHT: dict[str, Any] = {"network": "figure eight", "inflow": 300.0}
 
+ALONE = Network.from_tables({"name": ["a", "b"], "length": [90.0] * 2, "limit": [14.0] * 2}, {"start": [], "end": []})
+"""Two links that lead nowhere."""
+
 
 def vector(count: int = 2, **keywords: Any) -> NetworkVectorEnv:
     """Return a vector as a user makes it."""
@@ -161,6 +164,7 @@ def test_faces() -> None:
         ({"network": "crossroads.net.xml"}, "crossroads.net.xml"),
         ({"netwrok": "crossing"}, "task 'junction' got an unexpected keyword argument 'netwrok'."),
         ({"agents": 0}, "agents = 0"),
+        ({"network": ALONE}, "has no junction. Give one that has."),
         ({"circling": 20}, "circling = 20 changes nothing: inflow or trips arrive on network = 'crossing'. L"),
         ({"network": "figure eight"}, "inflow = 600.0 changes nothing: nobody arrives on network = 'figure eight'."),
         ({**EIGHT, "turns": (0.0, 1.0, 0.0)}, "turns = (0.0, 1.0, 0.0) changes nothing: nobody arrives"),
