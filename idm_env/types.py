@@ -150,13 +150,16 @@ class Journeys(NamedTuple):
     """Vehicles' ways through a network: whole numbers of shape ``(..., vehicles)`` (int32), ``reserved`` a truth value.
 
     ``routes`` (routes, links) are lists of links, filled with −1, of which a vehicle follows ``route`` and is on link
-    ``hop``. It has been ``told`` to stop at the next line (1), or that it counts as inside the junction behind it (2:
-    it goes before its foes, in red too), or has ``reserved`` that. Its trip is ``due`` at a step, and ``asks`` for a
-    speed (m/s); it ``entered`` and ``left`` at steps, −1 for not yet.
+    ``hop``. ``others`` (routes × links, 2) are places there (route × links + hop) on the lane to the left and to the
+    right, from where the same roads follow; −1 for none, and empty without such lanes. A vehicle has been ``told`` to
+    stop at the next line (1), or that it counts as inside the junction behind it (2: it goes before its foes, in red
+    too), or has ``reserved`` that. Its trip is ``due`` at a step, and ``asks`` for a speed (m/s); it ``entered`` and
+    ``left`` at steps, −1 for not yet.
     ``phases`` ``(..., signals)`` are what signals show, −1 for what their plan says.
     """
 
     routes: Tensor
+    others: Tensor
     route: Tensor
     hop: Tensor
     told: Tensor

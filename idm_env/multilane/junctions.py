@@ -20,8 +20,12 @@ from idm_env.roads.journeys import Travelled
 from idm_env.roads.merging import on_lanes
 from idm_env.roads.network import Network, padded
 from idm_env.roads.network_demand import Demand
+from idm_env.roads.ways import others
 from idm_env.step import CarFollowingStep
 from idm_env.types import FAR, Journeys, Params, State, worthwhile
+
+DECIDED = ("route", "hop", "told", "reserved", "entered", "left")
+"""What events decide of journeys."""
 
 NEVER = 1 << 30
 """Step at which those are due who never are."""
@@ -51,6 +55,7 @@ class Event(NamedTuple):
     link: Tensor
     leader: Tensor
     follower: Tensor
+    route: Tensor
     hop: Tensor
     told: Tensor
     reserved: Tensor
@@ -67,10 +72,10 @@ def guided(stepping: CarFollowingStep) -> dict[str, Any]:
     return effects
 
 
-def rules_of(stepping: CarFollowingStep, params: Params) -> tuple[Any, tuple[Tensor, Tensor, Tensor]]:
-    """Return the effect with the rules at junctions, and T (s), s0 (m) and b (m/s²) of drivers, ``[..., n]``."""
+def rules_of(stepping: CarFollowingStep, params: Params) -> tuple[Any, tuple[Tensor, ...]]:
+    """Return the effect with the rules at junctions, and T (s), s0 (m), b and a (m/s²) of drivers, ``[..., n]``."""
     driver = stepping.base.driver(dict(params[stepping.base.name]))
-    return guided(stepping)["stop"], (driver.time_gap, driver.min_gap, driver.comfort_decel)
+    return guided(stepping)["stop"], (driver.time_gap, driver.min_gap, driver.comfort_decel, driver.max_accel)
 
 
 def every(stepping: CarFollowingStep) -> int:
@@ -93,7 +98,7 @@ def crossed(stepping: CarFollowingStep, state: State, params: Params) -> State:
     event: Event = stepping.event(state, params, now)
     links = state.lanes
     assert links is not None and links.journeys is not None
-    ways = links.journeys._replace(**{k: getattr(event, k) for k in ("hop", "told", "reserved", "entered", "left")})
+    ways = links.journeys._replace(**{k: getattr(event, k) for k in DECIDED})
     links = links._replace(lane=event.link, leader=event.leader, follower=event.follower, journeys=ways)
     view, fresh = Travelled(links, state.position), event.new >= ENTERED
     position = torch.where(fresh, 0.0, state.position - event.moved)
@@ -166,8 +171,9 @@ def travelling(
     whole = torch.int32
     due, asks = np.where(begun, 0, due), column([d.speed for d in many], 0.0, float)
     ways = Journeys(
-        torch.from_numpy(table), tensor(route, whole), tensor(np.maximum(hops, 0), whole), tensor(0, whole),
-        tensor(0, torch.bool), tensor(due, whole), tensor(asks), tensor(np.where(begun, 0, -1), whole),
+        torch.from_numpy(table), torch.from_numpy(others(network, table)), tensor(route, whole),
+        tensor(np.maximum(hops, 0), whole), tensor(0, whole), tensor(0, torch.bool), tensor(due, whole),
+        tensor(asks), tensor(np.where(begun, 0, -1), whole),
         tensor(-1, whole), torch.full((*shape[:-1], len(network.plans)), -1, dtype=whole),
     )  # fmt: skip
     return state._replace(lanes=state.lanes._replace(journeys=ways))

@@ -157,6 +157,28 @@ def _heading(points: np.ndarray, piece: int) -> float:
     return math.atan2(*(points[piece + 1] - points[piece])[::-1]) if len(points) > 1 else 0.0
 
 
+def others(network: Network, routes: Any) -> np.ndarray:
+    """Return where else routes ``(R, H)`` go on from the lanes beside over the same roads: ``Journeys.others``."""
+    if not (network.left >= 0).any():
+        return np.zeros((0,), np.int32)
+    numbers, places = dict[tuple[str, int], int](), dict[tuple[int, int], int]()
+    links, wide = np.ravel(routes).tolist(), np.shape(routes)[1]
+    edge, way, ways = "", 0, [0] * len(links)
+    for place in reversed(range(len(links))):
+        edge, way = (edge, way) if (place + 1) % wide else ("", 0)
+        if (link := links[place]) < 0 or network.inner[link]:
+            continue
+        if network.edge[link] != edge:
+            edge = network.edge[link]
+            way = numbers.setdefault((edge, way), len(numbers) + 1)
+            places[link, way] = place
+        ways[place] = way
+    lanes = np.stack((network.left, network.right), 1).tolist()
+    return np.array(
+        [[places.get((k, way), -1) for k in lanes[i]] for i, way in zip(links, ways, strict=True)], np.int32
+    )
+
+
 def keyed(seed: int, name: str) -> np.random.Generator:
     """Return random numbers by a counter under the key of a seed and a name: no other name changes them."""
     return np.random.Generator(np.random.Philox(key=[seed, zlib.crc32(name.encode())]))

@@ -220,7 +220,7 @@ class NetworkTask:
         plain, lanes = self._empty._replace(lanes=None), self._empty.lanes
         assert lanes is not None
         links = mapped(of_row, lanes._replace(journeys=None))
-        ways = Journeys(journeys.routes, *map(of_row, journeys[1:]))
+        ways = Journeys(*journeys[:2], *map(of_row, journeys[2:]))
         if self._read[1] is None:
             route, due = self._arrivals(draw)
             links = links._replace(lane=journeys.routes[:, 0][route.long()].long())

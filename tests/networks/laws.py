@@ -99,7 +99,8 @@ def _crossed(simulator: Simulator, before: State, after: State) -> list[str]:
     network, ways, was = simulator.road, journeys_of(after), journeys_of(before)
     assert isinstance(network, Network) and before.present is not None
     rules = guided(simulator)["stop"]
-    row, i = np.nonzero(((ways.hop > was.hop) & (before.present > 0)).numpy())
+    # Nobody comes to another link and to the lane beside in one event.
+    row, i = np.nonzero(((ways.hop > was.hop) & (ways.route == was.route) & (before.present > 0)).numpy())
     route, hop = ways.routes.numpy()[was.route.numpy()[row, i]], was.hop.numpy()[row, i]
     link, ahead = (route[np.arange(len(row)), k] for k in (hop, hop + 1))
     position, speed = (x.double().numpy()[row, i] for x in (before.position, before.speed))

@@ -86,12 +86,13 @@ def test_all_paths_change_lanes_alike() -> None:
             (slope,) = torch.autograd.grad(state.speed.sum(), [params["idm"]["time_gap"]])
         ends.append((state, slope))
     with torch.no_grad():
-        plain, _ = simulator.rollout(
-            travelling(simulator, many, params, dtype=torch.float64), {}, params, 400, keep=None
-        )
+        begun = travelling(simulator, many, params, dtype=torch.float64)
+        plain, _ = simulator.rollout(begun, {}, params, 400, keep=None)
     (kernel, a), (reference, b), (single, _) = ends
     assert kernel.lanes is not None and reference.lanes is not None and single.lanes is not None
-    assert (journeys_of(kernel).hop > 0).any() and torch.equal(kernel.lanes.lane, reference.lanes.lane)
+    assert (journeys_of(kernel).hop > 0).any() and (journeys_of(kernel).route != journeys_of(begun).route).any()
+    assert torch.equal(journeys_of(kernel).route, journeys_of(reference).route)
+    assert torch.equal(kernel.lanes.lane, reference.lanes.lane)
     assert torch.equal(kernel.position, plain.position) and torch.equal(kernel.position[1], single.position)
     assert torch.allclose(kernel.position, reference.position, rtol=0.0, atol=1e-9)
     assert a.abs() > 0.1 and torch.allclose(a, b, rtol=1e-8)
@@ -105,6 +106,26 @@ def test_two_who_want_each_others_lane_get_it() -> None:
     state = travelling(simulator, demand, params, hop=[0, 0], position=[117.9, 105.9], speed=[0.0, 0.0])
     state, _ = simulator.rollout(state, {}, params, 600, keep=None)
     assert int(counts(state).left) == 2
+
+
+@pytest.mark.parametrize(
+    ("leads", "beside", "changes"), [(True, 900.0, True), (False, 900.0, False), (True, 36.0, False)]
+)
+def test_who_gains_on_the_lane_beside_goes_there(leads: bool, beside: float, changes: bool) -> None:
+    """Behind somebody slow one changes if a way goes on from there, and if nobody is close on that lane."""
+    network = street(1000.0)
+    simulator, params = simulated(network)
+    params["idm"]["desired_speed"] = torch.tensor([2.0, 13.0, 13.0], dtype=torch.float64)
+    # Of a way that must come back no use is made.
+    demand = Demand(padded([WAYS[0], WAYS[1] if leads else WAYS[3]]), [0, 0, 1], np.zeros(3))
+    state = travelling(
+        simulator, demand, params, hop=[0] * 3, position=[80.0, 40.0, beside],
+        speed=[2.0, 9.0, 9.0], dtype=torch.float64,
+    )  # fmt: skip
+    state, _ = simulator.rollout(state, {}, params, 6, keep=None)
+    assert state.lanes is not None
+    assert state.lanes.lane.tolist()[:2] == [A, B if changes else A]
+    assert journeys_of(state).route.tolist() == [0, int(changes), 1]
 
 
 def test_routes_take_both_lanes_and_change_where_they_must() -> None:

@@ -36,9 +36,9 @@ whether somebody waits, or (2) has come from beside."""
 START, END, SIGNAL, INDEX, SHOWN, INSIDE, COMING, HOLDER = range(8)
 """Of moves, whole numbers: their links, signal and index, what it shows, how many are inside or have reserved, one who
 arrives within t_c (his slot and 1, 0 for nobody), and one of those inside."""
-SLOTS, LINKS, MOVES, WIDE, AGAINST, EACH = range(6)
+SLOTS, LINKS, MOVES, WIDE, AGAINST, EACH, OTHERS = range(7)
 MOST_DECEL, CRITICAL_GAP, SIGHT, REACH, EVERY, BRAKING, MORE = range(7)
-TIME_GAP, LEAST, BRAKE = range(3)
+TIME_GAP, LEAST, BRAKE, ACCEL_OF = range(4)
 
 W, K = 16, 8
 """Columns of vehicles, and of links and moves: what one needs is on two lines of a cache. Tables are handed on as
@@ -49,6 +49,8 @@ RED, GREEN, AMBER, YIELD = range(4)
 FREE, STOPS, CLEARS = range(3)
 """What a driver is told: nothing; to stop; and that he counts as inside, so that in red he goes before his foes."""
 FAR, OPEN = 1e4, 1e6
+GAIN = 0.2
+"""By how much a leader must brake less on the lane beside (m/s²), as in MOBIL (Kesting, Treiber and Helbing 2007)."""
 STANDS = 1.0
 """Speed below which whoever is behind a junction may not make room in time (m/s)."""
 SETBACK = 12.0
@@ -60,12 +62,12 @@ SAME, LED, CAME, CAME_BEHIND = range(4)
 @exact
 def event(step, dt, anew, sizes, tables, plans, phases):
     """Do one event; return how many vehicles there are. ``anew``: gates ahead are not known from the event before."""
-    car, tag, road, site, move, against, routes, rules, driver = tables
+    car, tag, road, site, move, against, routes, others, rules, driver = tables
     show(step * dt, sizes[MOVES], move, plans, phases)
     n = travel(step, anew, sizes, car, tag, road, site, move, routes)
     n = enter(step, n, sizes, car, tag, road, site, move, routes, rules, driver)
     sort(n, sizes[LINKS], car, tag, site)
-    if change(n, sizes, car, tag, road, site, routes, rules, driver):
+    if change(n, sizes, car, tag, road, site, routes, others, rules, driver):
         sort(n, sizes[LINKS], car, tag, site)
         for k in range(sizes[LINKS]):
             p = site[K * k + K + BEGIN] - 1
@@ -248,9 +250,7 @@ def enter(step, n, sizes, car, tag, road, site, move, routes, rules, driver):
         kind = entry(i, j, base, sizes[EACH], car, driver)
         if kind == SAME:
             continue
-        car[W * i + SPEED] = (
-            min(car[W * i + ENTERING], car[W * j + SPEED]) if kind == CAME_BEHIND else car[W * i + ENTERING]
-        )
+        car[W * i + SPEED] = min(car[W * i + ENTERING], car[W * j + SPEED] if kind == CAME_BEHIND else FAR)
         car[W * i + ACCEL], car[W * i + PRESENT], tag[W * i + ENTERED], tag[W * i + LEADER] = 0, 1, step, i
         tag[W * i + TOLD], tag[W * i + RESERVED], car[W * i + MOVED], tag[W * i + NEW] = FREE, 0, 0, kind
         tag[W * n + HERE] = i
@@ -264,72 +264,101 @@ def entry(i, j, base, each, car, driver):
     """Return how a vehicle enters behind vehicle ``j`` (−1: nobody), ``SAME`` for not at all."""
     if j < 0:
         return CAME
-    d = i if each > 1 else 0
-    v, v_l = car[W * i + ENTERING], car[W * j + SPEED]
-    room = base + car[W * j + POSITION] - car[W * j + LENGTH] - driver[LEAST * each + d]
-    if room >= v * driver[TIME_GAP * each + d] and v * v - v_l * v_l <= 2 * driver[BRAKE * each + d] * room:
+    v, v_l, room = car[W * i + ENTERING], car[W * j + SPEED], base + car[W * j + POSITION] - car[W * j + LENGTH]
+    if fits(i, room, v, v_l, 1, each, driver):
         return CAME
-    return CAME_BEHIND if room >= min(v, v_l) * driver[TIME_GAP * each + d] else SAME
+    return CAME_BEHIND if fits(i, room, min(v, v_l), v_l, 1, each, driver) else SAME
 
 
 @exact
-def change(n, sizes, car, tag, road, site, routes, rules, driver):
-    """Move whoever has to and finds room to the lane beside, one to each lane; return whether anybody has changed.
+def change(n, sizes, car, tag, road, site, routes, others, rules, driver):
+    """Move vehicles that must, and those that gain, to the lane beside; return whether any has moved, one to each lane.
+
+    Those whose way goes on from there, too, gain where ``a (s*/s)² − a (s*/s′)² > 0.2 m/s²``, s′ being the gap there.
+    They stay if they have reserved the junction.
+    """
+    some = False
+    for q in range(n):
+        i = tag[W * q + ORDER]
+        if tag[W * i + NEW] >= CAME or car[W * i + MOVED] > 0 or tag[W * i + RESERVED]:
+            continue
+        place, v = tag[W * i + ROUTE] * sizes[WIDE] + tag[W * i + HOP], car[W * i + SPEED]
+        if tag[W * i + GATE] == ASIDE:
+            if is_beside(tag[W * i + LINK], next_link(i, tag[W * i + HOP] + 1, sizes[WIDE], tag, routes), site):
+                some |= change_to(i, place + 1, np.inf, sizes, car, tag, road, site, routes, rules, driver)
+        elif sizes[OTHERS] > 0 and tag[W * i + LEADER] != i:
+            brakes = interaction(i, car[W * i + GAP], v, car[W * tag[W * i + LEADER] + SPEED], sizes[EACH], driver)
+            for side in range(2):
+                to = others[2 * place + side]
+                if brakes > GAIN and to >= 0 and tag[W * i + NEW] == SAME:
+                    some |= change_to(i, to, brakes, sizes, car, tag, road, site, routes, rules, driver)
+    return some
+
+
+@exact
+def interaction(i, gap, v, v_l, each, driver):
+    """Return the deceleration of IDM's interaction (m/s²), ``a (s*/s)²``."""
+    d = i if each > 1 else 0
+    a, time_gap = driver[ACCEL_OF * each + d], driver[TIME_GAP * each + d]
+    dynamic = v * time_gap + v * (v - v_l) / (2 * np.sqrt(a * driver[BRAKE * each + d]))
+    return a * ((driver[LEAST * each + d] + max(0, dynamic)) / max(gap, 0.1)) ** 2
+
+
+@exact
+def change_to(i, place, brakes, sizes, car, tag, road, site, routes, rules, driver):
+    """Move a vehicle to the lane beside at a place of ``routes``, if it may; return whether it has moved.
 
     ::
 
         s − (1 + u) s0 / 2 ≥ u v T    and    v² − v_l² ≤ 2 b (s − (1 + u) s0 / 2)
 
-    to the new leader and of the new follower, with u = min(1, s_line / reach): the nearer the end, the less is enough.
+    to the new leader and of the new follower. Who must (he ``brakes`` with ∞) has u = min(1, s_line / reach): the
+    nearer the end, the less is enough. Who gains has u = 1.
     Where somebody is about to come from behind the lane, one is taken to be at its beginning, as fast as may be.
-    The first who can stops behind somebody who stands at the end of his lane.
+    The first who can stops s0 behind somebody who stands at the end of his lane: nearer, neither could go.
     """
-    some, each = False, sizes[EACH]
-    for q in range(n):
-        i = tag[W * q + ORDER]
-        if tag[W * i + GATE] != ASIDE or tag[W * i + NEW] >= CAME or car[W * i + MOVED] > 0:
-            continue
-        k, to = tag[W * i + LINK], next_link(i, tag[W * i + HOP] + 1, sizes[WIDE], tag, routes)
-        if not is_beside(k, to, site):
-            continue
-        v, room = car[W * i + SPEED], car[W * i + LINE] - car[W * i + POSITION]
-        shift = car[W * i + POSITION] - car[W * i + POSITION] * road[K * to + LONG] / road[K * k + LONG]
-        x, p, end = car[W * i + POSITION] - shift, site[K * to + BEGIN], site[K * to + K + BEGIN]
-        share = min(1, max(0, room / rules[REACH]))
-        while p < end and car[W * tag[W * p + ORDER] + POSITION] >= x:
-            p += 1
-        base, rear, late = shift - shift, x - car[W * i + LENGTH], road[K * to + HEADING] + road[K * to + UNGUARDED] > 0
-        if p < end:
-            j = tag[W * p + ORDER]
-            gap, late = rear - car[W * j + POSITION], tag[W * j + RESERVED] > 0
-            late = late or not fits(j, gap, car[W * j + SPEED], v, share, each, driver)
-        elif late:
-            late = not fits(i, rear, road[K * to + FAST], v, share, each, driver)
-        tag[W * i + HOP], tag[W * i + LINK] = tag[W * i + HOP] + 1, to
-        if p > site[K * to + BEGIN]:
-            ahead = tag[W * p - W + ORDER]
-        else:
-            ahead, base = leader_ahead(i, rules[REACH], sizes[WIDE], car, tag, road, site, routes)
-        late = late or rear < 0 or site[K * to + QUEUE] == 2 or v * v * rules[BRAKING] > road[K * to + LONG] - x
-        if ahead >= 0 and not late:
-            gap = base + car[W * ahead + POSITION] - car[W * ahead + LENGTH] - x
-            late = not fits(i, gap, v, car[W * ahead + SPEED], share, each, driver)
-        if late:
-            tag[W * i + HOP], tag[W * i + LINK] = tag[W * i + HOP] - 1, k
-            while v < STANDS and room < SETBACK and p < end:
-                j, p = tag[W * p + ORDER], p + 1
-                if car[W * j + POSITION] + car[W * j + SPEED] * car[W * j + SPEED] * rules[BRAKING] <= rear:
-                    if not tag[W * j + RESERVED]:
-                        tag[W * j + GATE], car[W * j + LINE] = ASIDE, min(car[W * j + LINE], rear)
-                    break
-            continue
-        car[W * i + POSITION], car[W * i + MOVED], tag[W * i + NEW], tag[W * i + TOLD] = x, shift, LED, FREE
-        find_gate(i, sizes[WIDE], car, tag, road, site, routes)
-        site[K * to + QUEUE], some = 2, True
-        if p == end:
-            site[K * to + TAIL] = i
-        site[K * to + COUNT], site[K * k + COUNT] = site[K * to + COUNT] + 1, site[K * k + COUNT] - 1
-    return some
+    each, wide = sizes[EACH], sizes[WIDE]
+    k, to, old = tag[W * i + LINK], routes[place], tag[W * i + ROUTE] * wide + tag[W * i + HOP]
+    v, room = car[W * i + SPEED], car[W * i + LINE] - car[W * i + POSITION]
+    shift = car[W * i + POSITION] - car[W * i + POSITION] * road[K * to + LONG] / road[K * k + LONG]
+    x, p, end = car[W * i + POSITION] - shift, site[K * to + BEGIN], site[K * to + K + BEGIN]
+    share = min(1, max(0, room / rules[REACH])) if brakes == np.inf else 1
+    while p < end and car[W * tag[W * p + ORDER] + POSITION] >= x:
+        p += 1
+    base, rear, late = shift - shift, x - car[W * i + LENGTH], road[K * to + HEADING] + road[K * to + UNGUARDED] > 0
+    if p < end:
+        j = tag[W * p + ORDER]
+        gap, late = rear - car[W * j + POSITION], tag[W * j + RESERVED] > 0
+        late = late or not fits(j, gap, car[W * j + SPEED], v, share, each, driver)
+    elif late:
+        late = not fits(i, rear, road[K * to + FAST], v, share, each, driver)
+    tag[W * i + ROUTE], tag[W * i + HOP], tag[W * i + LINK] = place // wide, place % wide, to
+    if p > site[K * to + BEGIN]:
+        ahead = tag[W * p - W + ORDER]
+    else:
+        ahead, base = leader_ahead(i, rules[REACH], wide, car, tag, road, site, routes)
+    late = late or rear < 0 or site[K * to + QUEUE] == 2 or v * v * rules[BRAKING] > road[K * to + LONG] - x
+    if ahead >= 0 and not late:
+        gap = base + car[W * ahead + POSITION] - car[W * ahead + LENGTH] - x
+        late = not fits(i, gap, v, car[W * ahead + SPEED], share, each, driver)
+        late = late or brakes - interaction(i, gap, v, car[W * ahead + SPEED], each, driver) <= GAIN
+    if late:
+        tag[W * i + ROUTE], tag[W * i + HOP], tag[W * i + LINK] = old // wide, old % wide, k
+        while brakes == np.inf and v < STANDS and room < SETBACK and p < end:
+            j, p = tag[W * p + ORDER], p + 1
+            least = driver[LEAST * each + (j if each > 1 else 0)]
+            if car[W * j + POSITION] + car[W * j + SPEED] * car[W * j + SPEED] * rules[BRAKING] <= rear - least:
+                if not tag[W * j + RESERVED]:
+                    tag[W * j + GATE], car[W * j + LINE] = ASIDE, min(car[W * j + LINE], rear)
+                break
+        return False
+    car[W * i + POSITION], car[W * i + MOVED], tag[W * i + NEW], tag[W * i + TOLD] = x, shift, LED, FREE
+    find_gate(i, wide, car, tag, road, site, routes)
+    site[K * to + QUEUE] = 2
+    if p == end:
+        site[K * to + TAIL] = i
+    site[K * to + COUNT], site[K * k + COUNT] = site[K * to + COUNT] + 1, site[K * k + COUNT] - 1
+    return True
 
 
 @exact

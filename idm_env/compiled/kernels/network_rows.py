@@ -93,15 +93,15 @@ def unpack(source, which, columns, rows, n):
 
 
 @exact
-def tables_of(r, sizes, cars, tags, road, site, move, against, routes, rules, drivers):
+def tables_of(r, sizes, cars, tags, road, site, move, against, routes, others, rules, drivers):
     """Return pointers to the tables that the event of a row takes."""
     n, real, whole = sizes[SLOTS], cars.itemsize, tags.itemsize
-    driver = drivers.ctypes.data + min(r, len(drivers) - 1) * 3 * sizes[EACH] * real
+    driver = drivers.ctypes.data + min(r, len(drivers) - 1) * 4 * sizes[EACH] * real
     return (
         located(cars.ctypes.data + r * n * W * real, cars), located(tags.ctypes.data + r * n * W * whole, tags),
         located(road.ctypes.data, cars), located(site.ctypes.data, tags), located(move.ctypes.data, tags),
-        located(against.ctypes.data, tags), located(routes.ctypes.data, tags), located(rules.ctypes.data, cars),
-        located(driver, cars),
+        located(against.ctypes.data, tags), located(routes.ctypes.data, tags), located(others.ctypes.data, tags),
+        located(rules.ctypes.data, cars), located(driver, cars),
     )  # fmt: skip
 
 
@@ -175,8 +175,9 @@ def laid(halo, wide, tables, paths):
     slots, cells, led, leads, own, place, sizes = paths
     fits = True
     for r in range(len(slots)):
-        car, tag, _, site, _, _, _, _, _ = tables_of(r, *tables)
-        n = arrange(tables[0], car, tag, site)
+        own_tables = tables_of(r, *tables)
+        tag, site = own_tables[1], own_tables[3]
+        n = arrange(tables[0], own_tables[0], tag, site)
         one = slots[r], cells[r], led[r], leads[r], own[r], place[r], sizes[r]
         fits &= lay(n, halo, wide, tag, one) == 1
         for p in range(sizes[r, 0], wide):

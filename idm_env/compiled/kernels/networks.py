@@ -27,7 +27,7 @@ from idm_env.compiled.kernels.tiles import Array
 from idm_env.compiled.kernels.workspace import take
 from idm_env.compiled.scalar.record import Form
 from idm_env.multilane import before
-from idm_env.multilane.junctions import Event, every, guided, rules_of
+from idm_env.multilane.junctions import DECIDED, Event, every, guided, rules_of
 from idm_env.roads.chains import Places
 from idm_env.roads.network import Network
 from idm_env.types import Inputs, Params, State
@@ -60,6 +60,7 @@ class NetworkRows:
     move: Array
     against: Array
     routes: Array
+    others: Array
     rules: Array
     drivers: Array
     plans: tuple[Array, ...]
@@ -84,14 +85,16 @@ class NetworkRows:
         road, site, move, against, plans = _tables(network, kind)
         rules, drivers = _rules(stepping, params, state)
         routes = ways.routes.contiguous().numpy()
-        return cls(cars, tags, road, site, move, against, routes, rules, drivers, plans, phases)
+        others = ways.others.contiguous().numpy()
+        return cls(cars, tags, road, site, move, against, routes, others, rules, drivers, plans, phases)
 
     def tables(self) -> tuple[tuple[Any, ...], tuple[Array, ...], Array]:
         """Return the arguments of an event, with room of its own for its findings."""
         links, wide = len(self.site) - 1, self.routes.shape[1]
-        sizes = self.cars.shape[1], links, len(self.move), wide, self.against.shape[2], self.drivers.shape[2]
+        most = self.against.shape[2], self.drivers.shape[2], self.others.size
+        sizes = self.cars.shape[1], links, len(self.move), wide, *most
         own = (x.copy() for x in (self.road, self.site, self.move))
-        tables = sizes, self.cars, self.tags, *own, self.against, self.routes, self.rules, self.drivers
+        tables = sizes, self.cars, self.tags, *own, self.against, self.routes, self.others, self.rules, self.drivers
         return tables, tuple(x.copy() for x in self.plans), self.phases
 
     def parts(self, names: Sequence[str], shape: torch.Size) -> dict[str, Tensor]:
@@ -130,7 +133,7 @@ def _tables(network: Network, kind: np.dtype) -> tuple[Any, ...]:
 
 
 def _rules(stepping: CarFollowingStep, params: Params, state: State) -> tuple[Array, Array]:
-    """Return the rules at junctions, and T, s0 and b: (1, 3, 1) where they are the same for all, else (rows, 3, n)."""
+    """Return the rules at junctions, and T, s0, b and a: (1, 4, 1) where all have the same, else (rows, 4, n)."""
     stop, drivers = rules_of(stepping, params)
     like = state.speed
     alike = all(x.numel() == 1 for x in drivers)
@@ -266,7 +269,7 @@ def _in_place(
     links, shape = state.lanes, state.speed.shape
     assert links is not None and links.journeys is not None
     now = rows.parts((*MOVING, *Event._fields[4:-1]), shape)
-    ways = links.journeys._replace(**{k: now[k] for k in ("hop", "told", "reserved", "entered", "left")})
+    ways = links.journeys._replace(**{k: now[k] for k in DECIDED})
     links = links._replace(lane=now["link"], leader=now["leader"], follower=now["follower"], journeys=ways)
     memory = {effect.name: now[what] for what, effect in guided(simulator).items()}
     moved: dict[str, Any] = {k: now[k] for k in (*MOVING, "present")}
