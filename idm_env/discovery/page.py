@@ -12,7 +12,7 @@ from idm_env.discovery.compare import percent as change
 from idm_env.discovery.finish import Discovery
 from idm_env.discovery.result import Change, Result
 from idm_env.discovery.score import ALPHA, CLOSED_LOOP_SHARE
-from idm_env.discovery.selection import LEAST_GAIN, LEAST_SHARE
+from idm_env.discovery.selection import LEAST_SHARE, NAMED_GAIN
 from idm_env.discovery.units import ENOUGH_RUNS, MANY_RUNS
 from idm_env.discovery.verdict import HOLDS, Reason, Verdict
 from idm_env.reports import page as pages
@@ -37,7 +37,7 @@ def write(path: Path, d: Discovery) -> None:
     filters |= {"ends": _ends, "plain": words.plain, "amount": words.amount}
     filters["shares"] = lambda parts: " · ".join(f"{name} {percent(share)}" for name, share in parts.items())
     rules = {"enough_runs": ENOUGH_RUNS, "many_runs": MANY_RUNS, "free_share": f"{CLOSED_LOOP_SHARE:.0%}"}
-    rules |= {"level": percent(ALPHA), "least_gain": percent(LEAST_GAIN, 1), "least_share": percent(LEAST_SHARE)}
+    rules |= {"level": percent(ALPHA), "least_gain": percent(NAMED_GAIN, 1), "least_share": percent(LEAST_SHARE)}
     names: dict[str, Any] = {"r": r, "d": d, "law": law, "rules": rules | {"holds": f"{HOLDS - 1.0:.0%}"}}
     names |= {"titles": judgement.titles, "cards": cards(r, law) + words.rolled(r.rolled)}
     names |= {"draw": pictures, "picture": pages.picture}

@@ -22,6 +22,7 @@ from idm_env.discovery.score import SYSTEMATIC, half_width, held_out, log_gain
 from idm_env.discovery.search import Scored, Search
 from idm_env.discovery.selection import _same_class
 from idm_env.discovery.solve import Problem, Solution, _Nested, linearise, solve
+from idm_env.discovery.verdict import Reason
 from idm_env.effects import IDM, Brakes
 from idm_env.model_file import Model, load_model, save_model
 from idm_env.roads import Lane
@@ -283,3 +284,17 @@ def test_a_latency_below_a_step_that_was_all_that_was_asked_for_is_told(monkeypa
     null, steps, seen = selection._rounds(searching, null, 0)
     assert null is not solution and steps == [] and len(seen) == 1
     assert seen[0].winner is None and seen[0].leading is None
+
+
+@pytest.mark.parametrize(("gain", "reason"), [(0.018, Reason.NO_GAIN), (0.022, Reason.SMALL_SIZE)])
+def test_what_gains_less_than_two_percent_is_not_added(
+    gain: float, reason: Reason, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sure as it may be: a time gap that wanders makes stiffness gain 0.015, and that was named."""
+    searching, null = begun(made(7, runs=8, followers=1, seconds=30.0), "drag")
+    monkeypatch.setattr(selection, "_is_small", lambda *_: True)
+    gains = gain + 1e-4 * np.arange(-4.0, 4.0)
+    scored = [Scored(terms.simple("drag"), null, gains)]
+    this = selection.Round(scored, selection._tested(searching, scored, 0))
+    selection._choose(searching, null, this)
+    assert this.tested.p_value[0] < 0.05 and this.refusal is not None and this.refusal.reason is reason
