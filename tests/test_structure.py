@@ -288,7 +288,7 @@ def top_level() -> set[str]:
         (ways_up, 0),
         (classes_named_twice, 7),
         (lines_behind_a_step, 2234),
-        (lines_of_code, 35034),
+        (lines_of_code, 35028),
         (lines_of_networks, 3019),
         (functions_of_many_parameters, 15),
         (high_packages, 1),

@@ -248,13 +248,9 @@ def unread(columns: list[str]) -> list[Repair]:
     return [Repair("columns not read", len(looks), f"{len(looks)} {words}")] if looks else []
 
 
-def _plain(column: str) -> str:
-    return re.sub(r"\W+", "_", re.sub(r"\s*[\[(].*[\])]\s*$", "", column).lower()).strip("_")
-
-
 def _like(name: str, pattern: str, column: str) -> str | None:
     """Return a column with its unit, if it may be what ``name`` wants."""
-    plain = _plain(column)
+    plain = re.sub(r"\W+", "_", re.sub(r"\s*[\[(].*[\])]\s*$", "", column).lower()).strip("_")
     units = UNITS.get("speed_mps" if name == "range_rate_mps" else name.rpartition(".")[2], {})
     unit = next((u for u in units if plain.endswith(f"_{u}")), None)
     stem = plain.removesuffix(f"_{unit}") if unit else plain

@@ -68,7 +68,8 @@ def prepare(
     frame = keep_repairs(clock.regularise(frame, steps))
     frame = keep_repairs(speeds.complete(frame, steps))
     hidden = clean.on_clock(hidden, frame, steps)
-    frame = keep_repairs(leaders.steady(keep_repairs(_with_leaders(_with_lane(frame), source, hidden, steps))))
+    frame = frame if "lane" in frame.columns else frame.with_columns(pl.lit(None, pl.Int64).alias("lane"))
+    frame = keep_repairs(leaders.steady(keep_repairs(_with_leaders(frame, source, hidden, steps))))
     frame = keep_repairs(leaders.gaps(frame, source))
     overlaps = plausible.Overlaps()
     overlaps.add(frame)
@@ -106,10 +107,6 @@ def _with_ring(frame: pl.DataFrame, ring_length: float | None, source: str) -> p
     if "ring_length_m" in frame.columns and (frame["ring_length_m"] <= 0).any():
         raise DataError(f"{source}: ring_length_m holds values that are not positive; leave it empty for an open road.")
     return frame
-
-
-def _with_lane(frame: pl.DataFrame) -> pl.DataFrame:
-    return frame if "lane" in frame.columns else frame.with_columns(pl.lit(None, pl.Int64).alias("lane"))
 
 
 def _arranged(frame: pl.DataFrame) -> pl.DataFrame:

@@ -132,12 +132,8 @@ class RecordColumns:
         accel = np.where(present, self.accel[rows], 0.0)
         if smooth:
             stride = round(dt / float(self.step[rows[present][0]])) if present.any() else 1
-            for begin, end in _stretches(rows, present, stride):
+            for begin, end in spans(np.diff(rows) == stride, present):
                 part = slice(begin, end)
-                place[part], speed[part], accel[part] = fuse(place[part], speed[part], dt)
+                if end - begin >= 4:
+                    place[part], speed[part], accel[part] = fuse(place[part], speed[part], dt)
         return VehicleRecord(place, speed, accel, length, present)
-
-
-def _stretches(rows: np.ndarray, present: np.ndarray, stride: int) -> list[tuple[int, int]]:
-    """Return [begin, end) of stretches in which one vehicle is present without a break, at least 4 samples long."""
-    return [(begin, end) for begin, end in spans(np.diff(rows) == stride, present) if end - begin >= 4]

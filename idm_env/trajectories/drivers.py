@@ -25,7 +25,8 @@ def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]
     clock = filtered.motion.time_s
     dt = float(clock[1] - clock[0]) if len(clock) > 1 else 0.1
     near = np.isfinite(filtered.gap) & (filtered.gap > 0) & (filtered.gap < FARTHEST_M)
-    for begin, end in _stretches(filtered.leader, near):
+    leader = filtered.leader
+    for begin, end in spans(leader[1:] == leader[:-1], near & (leader != "")):
         for lead in leaders.get((filtered.track.run_id, str(filtered.leader[begin])), ()):
             first, last = lead.motion.time_s[[0, -1]]
             inside = clock[begin] >= first - 1e-9 and clock[end - 1] <= last + 1e-9
@@ -46,11 +47,6 @@ def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]
     names = track.run_id, track.vehicle_id, str(filtered.leader[begin]), track.key
     own = time, position, speed, filtered.gap[part]
     return Episode(*names, dt, *own, track.length_m, ahead, far[0], far[1], far[2], position, {}, {})
-
-
-def _stretches(leader: np.ndarray, usable: np.ndarray) -> list[tuple[int, int]]:
-    """Return [begin, end) of stretches of usable steps behind one leader."""
-    return spans(leader[1:] == leader[:-1], usable & (leader != ""))
 
 
 def fit_drivers(

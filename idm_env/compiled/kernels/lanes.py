@@ -193,7 +193,8 @@ def planned(
     strides = table([*(s for _, s in operands), (0, size, 1)])
     differentiated = list[Tensor]()
     if torch.is_grad_enabled():
-        differentiated = _differentiated(program.moving, state, values[len(program.statics) :], numbers, kernel.signals)
+        past, parameters = [state.memory[PAST]] if kernel.signals else [], values[len(program.statics) :]
+        differentiated = [*starts(state, program.moving), *past, *parameters, *numbers]
     tape = any(x.requires_grad for x in differentiated)
     # Without a tape nobody asks for states between, and whole rows stay in the cache.
     block *= 1 if tape or kernel.signals or size > tiles.TILE else 4
@@ -202,13 +203,6 @@ def planned(
         tuple(a for a, _ in operands), strides,
     )  # fmt: skip
     return plan, differentiated
-
-
-def _differentiated(
-    moving: tuple[str, ...], state: State, parameters: list[Tensor], numbers: list[Tensor], signals: int
-) -> list[Tensor]:
-    """Return what a rollout is differentiated by: states, the past, parameters, inputs."""
-    return [*starts(state, moving), *([state.memory[PAST]] if signals else []), *parameters, *numbers]
 
 
 def _forward(
