@@ -236,7 +236,7 @@ def deadlocked(stepping: CarFollowingStep, state: State, params: Params) -> Tens
     """Return how many vehicles of every row wait for one another in a circle, ``(...)``: they will wait for ever.
 
     A vehicle that stands (below 0.1 m/s) waits for its leader, if that is within s0 + 1 m, or for another one to leave
-    the junction or the link behind it, or to go first.
+    the junction or the link behind it, or to go first, or to leave room on the lane beside.
     """
     event: Event = stepping.event(state, params, torch.ones_like(state.step, dtype=torch.bool))
     own = torch.arange(state.speed.shape[-1], device=state.speed.device).expand(state.speed.shape)

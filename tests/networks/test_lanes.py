@@ -11,7 +11,7 @@ import torch
 from idm_env import IDM, Brakes, Simulator
 from idm_env.backends import off
 from idm_env.effects import LinkLimit, StopLine
-from idm_env.multilane.junctions import counts, journeys_of, travelling
+from idm_env.multilane.junctions import counts, deadlocked, journeys_of, travelling
 from idm_env.roads.network import Network, Plan, padded
 from idm_env.roads.network_demand import Demand
 from idm_env.roads.ways import Ways
@@ -155,3 +155,13 @@ def test_a_lane_too_short_for_a_change_is_refused() -> None:
         Demand(padded(WAYS), [2], [0.0]).check(street(25.0))
     with pytest.raises(ValueError, match=r"^route 0: link 'd' does not follow 'a', nor is it the lane beside\.$"):
         Demand(padded([(A, D)]), [0], [0.0]).check(street())
+
+
+def test_a_standstill_at_lane_ends_is_counted() -> None:
+    """A lorry and a car want each other's lane, and a queue fills the room that either would need."""
+    network = street()
+    simulator, params = simulated(network)
+    demand = Demand(padded(WAYS), [2, 0, 3, 1], np.zeros(4), length=np.array([12.0, 5.0, 5.0, 5.0]))
+    state = travelling(simulator, demand, params, hop=[0] * 4, position=[117.9, 103.5, 105.9, 98.5], speed=[0.0] * 4)
+    state, _ = simulator.rollout(state, {}, params, 1200, keep=None)
+    assert int(counts(state).left) == 0 and int(deadlocked(simulator, state, params)) == 3

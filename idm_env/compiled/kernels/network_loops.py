@@ -23,7 +23,7 @@ before, the speed to enter at, where the next line is, closed or not, and the li
 TAG: tuple[str, ...] = ("link", "leader", "follower", "route", "hop", "told", "reserved", "due", "entered", "left")
 TAG += ("new", "gate", "here", "order", "waits")
 """Of vehicles, whole numbers: state, and behind it what is new, the next move, the slots that are here, in any
-order and in that of links, and for whom a vehicle waits at its gate (−1: for no vehicle)."""
+order and in that of links, and for whom a vehicle waits at its gate or lane end (−1: for no vehicle)."""
 POSITION, SPEED, ACCEL, GAP, LENGTH, PRESENT, ASKS, STOP, LIMIT, BASE, MOVED, ENTERING, LINE, LATER = range(len(CAR))
 LINK, LEADER, FOLLOWER, ROUTE, HOP, TOLD, RESERVED, DUE, ENTERED, LEFT, NEW, GATE, HERE, ORDER, WAITS = range(len(TAG))
 LONG, FAST, TRAIL_BASE, HEADING, UNGUARDED = range(5)
@@ -326,8 +326,8 @@ def change_to(i, place, brakes, sizes, car, tag, road, site, routes, rules, driv
     while p < end and car[W * tag[W * p + ORDER] + POSITION] >= x:
         p += 1
     base, rear, late = shift - shift, x - car[W * i + LENGTH], road[K * to + HEADING] + road[K * to + UNGUARDED] > 0
-    if p < end:
-        j = tag[W * p + ORDER]
+    j = tag[W * p + ORDER] if p < end else NONE
+    if j >= 0:
         gap, late = rear - car[W * j + POSITION], tag[W * j + RESERVED] > 0
         late = late or not fits(j, gap, car[W * j + SPEED], v, share, each, driver)
     elif late:
@@ -339,11 +339,11 @@ def change_to(i, place, brakes, sizes, car, tag, road, site, routes, rules, driv
         ahead, base = leader_ahead(i, rules[REACH], wide, car, tag, road, site, routes)
     late = late or rear < 0 or site[K * to + QUEUE] == 2 or v * v * rules[BRAKING] > road[K * to + LONG] - x
     if ahead >= 0 and not late:
-        gap = base + car[W * ahead + POSITION] - car[W * ahead + LENGTH] - x
+        j, gap = ahead, base + car[W * ahead + POSITION] - car[W * ahead + LENGTH] - x
         late = not fits(i, gap, v, car[W * ahead + SPEED], share, each, driver)
         late = late or brakes - interaction(i, gap, v, car[W * ahead + SPEED], each, driver) <= GAIN
     if late:
-        tag[W * i + ROUTE], tag[W * i + HOP], tag[W * i + LINK] = old // wide, old % wide, k
+        tag[W * i + ROUTE], tag[W * i + HOP], tag[W * i + LINK], tag[W * i + WAITS] = old // wide, old % wide, k, j
         while brakes == np.inf and v < STANDS and room < SETBACK and p < end:
             j, p = tag[W * p + ORDER], p + 1
             least = driver[LEAST * each + (j if each > 1 else 0)]
@@ -451,7 +451,7 @@ def look_ahead(i, sizes, car, tag, road, site, move, routes, rules, driver):
     Before a link of a lower limit he brakes as before a closed line, until he is as slow.
     """
     v, k, m, room = car[W * i + SPEED], tag[W * i + LINK], tag[W * i + GATE], car[W * i + LINE] - car[W * i + POSITION]
-    tag[W * i + WAITS] = NONE
+    tag[W * i + WAITS] = tag[W * i + WAITS] if m == ASIDE else NONE
     car[W * i + LIMIT], slower = road[K * k + FAST], car[W * i + LATER] < min(v, road[K * k + FAST])
     car[W * i + STOP] = road[K * k + LONG] if slower else OPEN
     if m == ASIDE and room < 2 * v * v * rules[BRAKING] + SETBACK:
