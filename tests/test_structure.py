@@ -446,11 +446,13 @@ def named_in(cls: type) -> set[str]:
 def test_what_is_added_to_the_package_is_named_in_few_of_its_files() -> None:
     """An effect in none, a task in two: its class where tasks are listed, its name where ids are registered."""
     from idm_env.effects import ALL, CANDIDATES
+    from idm_env.envs.network_faces import KINDS
     from idm_env.tasks import ON_NETWORKS, TASKS
 
     for name in CANDIDATES:
         assert named_in(ALL[name]) == set(), name
     assert ({*TASKS}, ON_NETWORKS) == ({*idm_env._TASKS}, idm_env._ON_NETWORKS)
+    assert (*KINDS,) == ON_NETWORKS
     for task in TASKS.values():
         heirs = {str(Path(sys.modules[cls.__module__].__file__ or "").relative_to(PACKAGE)) for cls in TASKS.values()
                  if issubclass(cls, task)}  # fmt: skip

@@ -91,12 +91,11 @@ def finished(
     if judgement.is_exact(least):
         judgement = replace(judgement, added=False, refusal=judgement.refusal or Refusal(Reason.SMALL_SIZE, least))
     elif laws:
-        noise_m = floor["horizon_rmse_m"]
-        best = best_beyond_noise(laws, of_laws, noise_m)
+        best = best_beyond_noise(laws, of_laws, floor["horizon_rmse_m"])
         evaluation, decided, judgement, last = _on_the_best((evaluation, decided, judgement, last), best, searched)
         if evaluation.adapt and judgement.of_all is not None:
             kinds = fleet.found(laws, judgement.of_all, of_laws.among, seed)
-            if kinds is None or kinds.column or _stand_out(laws, of_laws, noise_m, two=True):
+            if kinds is None or kinds.column or _stand_out(laws, of_laws, floor["horizon_rmse_m"], two=True):
                 judgement = judgement.split(kinds)
     null, prepared, problem = decided.null, evaluation.records, evaluation.searching.problem
     first, before = evaluation.of_null
@@ -160,9 +159,9 @@ def _on_the_best(before: Found, best: bases.Law, searched: Searched) -> Found:
     # A law with all candidates as its drivers' own strengths leaves nothing to try.
     search, own = evaluation.searching, best.model.catalogue
     has_candidates = search.located or not set(search.names) <= set(own.personal)
-    if not best.against or few or not has_candidates or not evaluation.adapt or now.of_all is None or (
-        now.added and improves(compare(best.errors, now.of_all, evaluation.seed))
-    ):  # fmt: skip
+    if not best.against or few or not has_candidates or not evaluation.adapt or now.of_all is None:
+        return evaluation, decided, now, last
+    if now.added and improves(compare(best.errors, now.of_all, evaluation.seed)):
         return evaluation, decided, now, last
     # In a law's loop there is room for all candidates.
     room = search.base.catalogue

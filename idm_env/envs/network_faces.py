@@ -30,11 +30,6 @@ KINDS: dict[str, type[SignalsTask] | type[JunctionTask]] = {x.name: x for x in (
 """Tasks on networks by name."""
 
 
-def is_on_network(task: object) -> bool:
-    """Tell whether a task, whatever its type, is one on a network."""
-    return isinstance(task, str) and task in KINDS
-
-
 class _Worlds:
     """Some worlds of a task, their seeds and the numbers of their episodes."""
 

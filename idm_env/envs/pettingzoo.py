@@ -25,9 +25,10 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 from idm_env.envs.batch import Batch, Outcome
 from idm_env.envs.gym import Pictures
 from idm_env.envs.info import ids
-from idm_env.envs.network_faces import is_on_network, network_parallel_env
+from idm_env.envs.network_faces import network_parallel_env
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, numpy_dtype, observation_box
+from idm_env.tasks import is_on_network
 from idm_env.validation import shown, whole
 
 _SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0

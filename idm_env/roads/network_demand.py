@@ -102,6 +102,8 @@ def without_turns_back(network: Network) -> Network:
     pieces = [shape if len(shape) > 1 else np.zeros((2, 2)) for shape in network.shape or [()] * len(network.names)]
     first, last = (np.array([x[i + 1] - x[i] for x in pieces]) @ (1.0, 1.0j) for i in (0, -2))
     stays = np.abs(np.angle(first[network.end] * last[network.start].conj(), deg=True)) <= 170.0
+    if stays.all():
+        return network
     rows = np.append(np.where(stays, np.cumsum(stays) - 1, NONE), NONE)
     columns = {name: getattr(network, name)[stays] for name in ("start", "end", "path", "signal", "index")}
     return replace(network, **columns, **{name: rows[getattr(network, name)[stays]] for name in ("foes", "yields")})

@@ -156,6 +156,8 @@ class _Reader:
             speed = self._entry_speed(element, self.kinds[one[0]]["idm.desired_speed"], self.limit[route[0]], random)
             kind = self._driver(one[0], round(_draw_share(one[2], shares), 3))
             self.rows.append((self.numbers.setdefault(route, len(self.numbers)), depart, speed, one[1], kind))
+            if len(self.rows) > MOST_VEHICLES:
+                raise ValueError(f"{name(element)} brings more than {MOST_VEHICLES} vehicles. Give it fewer.")
 
     def _driver(self, kind: int, factor: float) -> int:
         """Return the row of ``kinds`` of those who are of a kind and drive a share of limits."""

@@ -138,9 +138,7 @@ class Ways:
         return {self.network.edge[end]: self.sides[move] for end, _, move in onward}
 
     def draw_route(self, edge: str, shares: Sequence[float], random: np.random.Generator) -> Route:
-        """Return a route from an edge to where no move leads on. ValueError where none is seen, or for shares."""
-        if len(shares) != 3 or not (min(shares) >= 0.0 and 0.0 < sum(shares) < math.inf):
-            raise ValueError(f"shares = {tuple(shares)} must be three numbers from 0 on: left, straight on, right.")
+        """Return a route from an edge to where no move leads on. ValueError where none is seen."""
         for _ in range(100):
             edges = [edge]
             while (turns := self._turns(edges[-1])) and len(edges) < MOST_MOVES:
@@ -174,9 +172,8 @@ def others(network: Network, routes: Any) -> np.ndarray:
             places[link, way] = place
         ways[place] = way
     lanes = np.stack((network.left, network.right), 1).tolist()
-    return np.array(
-        [[places.get((k, way), -1) for k in lanes[i]] for i, way in zip(links, ways, strict=True)], np.int32
-    )
+    pairs = zip(links, ways, strict=True)
+    return np.array([[places.get((k, way), -1) for k in lanes[i]] for i, way in pairs], np.int32)
 
 
 def keyed(seed: int, name: str) -> np.random.Generator:
@@ -195,6 +192,8 @@ def draw_turns(
     ways = Ways(network)
     rates = per_hour if isinstance(per_hour, Mapping) else dict.fromkeys(ways.entries, per_hour)
     validation.in_interval("seconds", float(seconds), 0.0, 1e6, "s")
+    if len(shares) != 3 or not (min(shares) >= 0.0 and 0.0 < sum(shares) < math.inf):
+        raise ValueError(f"shares = {tuple(shares)} must be three numbers from 0 on: left, straight on, right.")
     numbers: dict[Route, int] = {}
     route, depart = list[int](), list[float]()
     for edge, rate in rates.items():

@@ -28,7 +28,6 @@ _TASKS: list[type[Task]] = [RingTask, FollowTask, PlatoonTask, ReplayTask, Repla
 _TASKS += [OpenHighwayTask, MergeTask, BottleneckTask, ApproachTask]
 TASKS = {task.name: task for task in _TASKS}
 ON_NETWORKS = ("signals", "junction")
-"""Tasks that only environments of networks make."""
 
 
 def make_task(task: str = "ring", *, trusted: bool = False, **choices: Any) -> Task:
@@ -47,11 +46,16 @@ def task_with(task: str, choices: Mapping[str, Any], others: Iterable[str] = ())
 
     ValueError for an unknown task, KeywordError for an unknown keyword.
     """
-    if isinstance(task, str) and task in ON_NETWORKS:
+    if is_on_network(task):
         raise ValueError(f"task '{task}' stands on a network, which only Gymnasium and PettingZoo make. Use gym.make.")
     if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"unknown task {shown(task)}.{nearest(shown(task), [*TASKS, *ON_NETWORKS])}")
     return with_keywords(task, TASKS[task], choices, others)
+
+
+def is_on_network(task: object) -> bool:
+    """Tell whether a task, whatever its type, is one on a network: only environments of networks make it."""
+    return isinstance(task, str) and task in ON_NETWORKS
 
 
 def with_keywords(task: str, kind: Any, choices: Mapping[str, Any], others: Iterable[str] = ()) -> Any:

@@ -25,8 +25,7 @@ def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]
     clock = filtered.motion.time_s
     dt = float(clock[1] - clock[0]) if len(clock) > 1 else 0.1
     near = np.isfinite(filtered.gap) & (filtered.gap > 0) & (filtered.gap < FARTHEST_M)
-    leader = filtered.leader
-    for begin, end in spans(leader[1:] == leader[:-1], near & (leader != "")):
+    for begin, end in spans(filtered.leader[1:] == filtered.leader[:-1], near & (filtered.leader != "")):
         for lead in leaders.get((filtered.track.run_id, str(filtered.leader[begin])), ()):
             first, last = lead.motion.time_s[[0, -1]]
             inside = clock[begin] >= first - 1e-9 and clock[end - 1] <= last + 1e-9

@@ -175,11 +175,10 @@ def laid(halo, wide, tables, paths):
     slots, cells, led, leads, own, place, sizes = paths
     fits = True
     for r in range(len(slots)):
-        own_tables = tables_of(r, *tables)
-        tag, site = own_tables[1], own_tables[3]
-        n = arrange(tables[0], own_tables[0], tag, site)
+        mine = tables_of(r, *tables)
+        n = arrange(tables[0], mine[0], mine[1], mine[3])
         one = slots[r], cells[r], led[r], leads[r], own[r], place[r], sizes[r]
-        fits &= lay(n, halo, wide, tag, one) == 1
+        fits &= lay(n, halo, wide, mine[1], one) == 1
         for p in range(sizes[r, 0], wide):
             slots[r, p], led[r, p], leads[r, p] = 0, 0, 0
     return fits

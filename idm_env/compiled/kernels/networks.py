@@ -90,9 +90,8 @@ class NetworkRows:
 
     def tables(self) -> tuple[tuple[Any, ...], tuple[Array, ...], Array]:
         """Return the arguments of an event, with room of its own for its findings."""
-        links, wide = len(self.site) - 1, self.routes.shape[1]
-        most = self.against.shape[2], self.drivers.shape[2], self.others.size
-        sizes = self.cars.shape[1], links, len(self.move), wide, *most
+        links, wide, foes = len(self.site) - 1, self.routes.shape[1], self.against.shape[2]
+        sizes = self.cars.shape[1], links, len(self.move), wide, foes, self.drivers.shape[2], self.others.size
         own = (x.copy() for x in (self.road, self.site, self.move))
         tables = sizes, self.cars, self.tags, *own, self.against, self.routes, self.others, self.rules, self.drivers
         return tables, tuple(x.copy() for x in self.plans), self.phases
