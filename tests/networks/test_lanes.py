@@ -98,14 +98,19 @@ def test_all_paths_change_lanes_alike() -> None:
     assert a.abs() > 0.1 and torch.allclose(a, b, rtol=1e-8)
 
 
-def test_two_who_want_each_others_lane_get_it() -> None:
-    """Both stand at the end of their lanes, side by side; he who must go to the right leaves room ahead."""
+@pytest.mark.parametrize("length", [5.0, 12.0, 18.0])
+def test_two_who_want_each_others_lane_get_it(length: float) -> None:
+    """They stand at the end of their lanes, a queue beside one; he who must go to the right leaves room ahead.
+
+    That was room for a car, and lorries stood there for ever.
+    """
     network = street()
     simulator, params = simulated(network)
-    demand = Demand(padded(WAYS[2:]), np.arange(2), np.zeros(2))
-    state = travelling(simulator, demand, params, hop=[0, 0], position=[117.9, 105.9], speed=[0.0, 0.0])
+    demand = Demand(padded(WAYS), [2, 0, 3], np.zeros(3), length=np.array([length, 5.0, 5.0]))
+    place = [117.9, 115.8 - length, 110.9 - length]
+    state = travelling(simulator, demand, params, hop=[0] * 3, position=place, speed=[0.0] * 3)
     state, _ = simulator.rollout(state, {}, params, 600, keep=None)
-    assert int(counts(state).left) == 2
+    assert int(counts(state).left) == 3
 
 
 @pytest.mark.parametrize(

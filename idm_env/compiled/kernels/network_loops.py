@@ -5,8 +5,9 @@ gaps are a few lines here, the same as in ``multilane.junctions``, where they ar
 
 What belongs to vehicles stands in ``car`` (numbers) and ``tag`` (whole numbers), to links in ``road`` and ``site``, to
 moves in ``move``: a row each, a column for each name below. ``against`` are foes and yields ``(2, M, F)``,
-``rules`` b_m (m/s²), t_c (s), sight and reach (m), the time to the next event (s), 1 / 2b_m, and how far one may come
-until then beyond v²/2b_m and at a constant speed (m); ``driver`` are T, s0 and b of all, or of each.
+``rules`` b_m (m/s²), t_c (s), sight and reach (m), the time to the next event (s), 1 / 2b_m, how far one may come
+until then beyond v²/2b_m and at a constant speed, and room for the longest vehicle (m); ``driver`` are T, s0 and b of
+all, or of each.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -37,7 +38,7 @@ START, END, SIGNAL, INDEX, SHOWN, INSIDE, COMING, HOLDER = range(8)
 """Of moves, whole numbers: their links, signal and index, what it shows, how many are inside or have reserved, one who
 arrives within t_c (his slot and 1, 0 for nobody), and one of those inside."""
 SLOTS, LINKS, MOVES, WIDE, AGAINST, EACH, OTHERS = range(7)
-MOST_DECEL, CRITICAL_GAP, SIGHT, REACH, EVERY, BRAKING, MORE = range(7)
+MOST_DECEL, CRITICAL_GAP, SIGHT, REACH, EVERY, BRAKING, MORE, SETBACK = range(8)
 TIME_GAP, LEAST, BRAKE, ACCEL_OF = range(4)
 
 W, K = 16, 8
@@ -53,8 +54,6 @@ GAIN = 0.2
 """By how much a leader must brake less on the lane beside (m/s²), as in MOBIL (Kesting, Treiber and Helbing 2007)."""
 STANDS = 1.0
 """Speed below which whoever is behind a junction may not make room in time (m/s)."""
-SETBACK = 12.0
-"""Whoever must go to the right stops so far before the end of his lane (m): who comes from there finds room ahead."""
 SAME, LED, CAME, CAME_BEHIND = range(4)
 """What is new of a vehicle: nothing, its leader, itself, itself at its leader's speed."""
 
@@ -64,7 +63,7 @@ def event(step, dt, anew, sizes, tables, plans, phases):
     """Do one event; return how many vehicles there are. ``anew``: gates ahead are not known from the event before."""
     car, tag, road, site, move, against, routes, others, rules, driver = tables
     show(step * dt, sizes[MOVES], move, plans, phases)
-    n = travel(step, anew, sizes, car, tag, road, site, move, routes)
+    n = travel(step, anew, sizes, car, tag, road, site, move, routes, rules)
     n = enter(step, n, sizes, car, tag, road, site, move, routes, rules, driver)
     sort(n, sizes[LINKS], car, tag, site)
     if change(n, sizes, car, tag, road, site, routes, others, rules, driver):
@@ -132,7 +131,7 @@ def put_on_link(i, wide, car, tag, road, site, move, routes):
 
 
 @exact
-def travel(step, anew, sizes, car, tag, road, site, move, routes):
+def travel(step, anew, sizes, car, tag, road, site, move, routes, rules):
     """Move everybody to the next link who is beyond the end of his; return how many have not left."""
     for k in range(sizes[LINKS]):
         site[K * k + TAIL], site[K * k + TRAIL], site[K * k + COUNT], site[K * k + QUEUE] = NONE, NONE, 0, 0
@@ -168,7 +167,7 @@ def travel(step, anew, sizes, car, tag, road, site, move, routes):
         n += 1
         put_on_link(i, sizes[WIDE], car, tag, road, site, move, routes)
         if far > 0 or anew or tag[W * i + GATE] == ASIDE:
-            find_gate(i, sizes[WIDE], car, tag, road, site, routes)
+            find_gate(i, sizes[WIDE], car, tag, road, site, routes, rules)
         if tag[W * i + RESERVED]:
             reserve(i, tag[W * i + GATE], 1, car, tag, road, move)
     return n
@@ -200,8 +199,11 @@ def leader_ahead(i, reach, wide, car, tag, road, site, routes):
 
 
 @exact
-def find_gate(i, wide, car, tag, road, site, routes):
-    """Find a vehicle's next move, −1 for none, and the way to its line from the beginning of his link; and a limit."""
+def find_gate(i, wide, car, tag, road, site, routes, rules):
+    """Find a vehicle's next move, −1 for none, and the way to its line from the beginning of his link; and a limit.
+
+    Whoever must go to the right stops before the end of his lane: who comes from there finds room ahead.
+    """
     own, way, h = tag[W * i + LINK], road[K * tag[W * i + LINK] + LONG], tag[W * i + HOP] + 1
     k = next_link(i, h, wide, tag, routes)
     car[W * i + LATER], tag[W * i + GATE] = road[K * (max(k, 0)) + FAST] if k >= 0 else FAR, NONE
@@ -217,7 +219,7 @@ def find_gate(i, wide, car, tag, road, site, routes):
         own, k = k, next_link(i, h, wide, tag, routes)
     car[W * i + LINE] = way
     if tag[W * i + GATE] == ASIDE and site[K * k + BESIDE] == own:
-        car[W * i + LINE] -= SETBACK
+        car[W * i + LINE] = max(0, car[W * i + LINE] - rules[SETBACK])
 
 
 @exact
@@ -243,7 +245,7 @@ def enter(step, n, sizes, car, tag, road, site, move, routes, rules, driver):
         j, base = leader_ahead(i, rules[REACH], sizes[WIDE], car, tag, road, site, routes)
         if site[K * k + TAIL] >= 0:
             j, base = site[K * k + TAIL], base - base
-        find_gate(i, sizes[WIDE], car, tag, road, site, routes)
+        find_gate(i, sizes[WIDE], car, tag, road, site, routes, rules)
         v = min(car[W * i + ASKS], road[K * k + FAST])
         fast = np.sqrt(2 * rules[MOST_DECEL] * car[W * i + LINE]) if tag[W * i + GATE] >= 0 else v
         car[W * i + ENTERING] = min(v, fast)
@@ -344,7 +346,7 @@ def change_to(i, place, brakes, sizes, car, tag, road, site, routes, rules, driv
         late = late or brakes - interaction(i, gap, v, car[W * ahead + SPEED], each, driver) <= GAIN
     if late:
         tag[W * i + ROUTE], tag[W * i + HOP], tag[W * i + LINK], tag[W * i + WAITS] = old // wide, old % wide, k, j
-        while brakes == np.inf and v < STANDS and room < SETBACK and p < end:
+        while brakes == np.inf and v < STANDS and room < rules[SETBACK] and p < end:
             j, p = tag[W * p + ORDER], p + 1
             least = driver[LEAST * each + (j if each > 1 else 0)]
             if car[W * j + POSITION] + car[W * j + SPEED] * car[W * j + SPEED] * rules[BRAKING] <= rear - least:
@@ -353,7 +355,7 @@ def change_to(i, place, brakes, sizes, car, tag, road, site, routes, rules, driv
                 break
         return False
     car[W * i + POSITION], car[W * i + MOVED], tag[W * i + NEW], tag[W * i + TOLD] = x, shift, LED, FREE
-    find_gate(i, wide, car, tag, road, site, routes)
+    find_gate(i, wide, car, tag, road, site, routes, rules)
     site[K * to + QUEUE] = 2
     if p == end:
         site[K * to + TAIL] = i
@@ -454,8 +456,8 @@ def look_ahead(i, sizes, car, tag, road, site, move, routes, rules, driver):
     tag[W * i + WAITS] = tag[W * i + WAITS] if m == ASIDE else NONE
     car[W * i + LIMIT], slower = road[K * k + FAST], car[W * i + LATER] < min(v, road[K * k + FAST])
     car[W * i + STOP] = road[K * k + LONG] if slower else OPEN
-    if m == ASIDE and room < 2 * v * v * rules[BRAKING] + SETBACK:
-        car[W * i + STOP] = min(car[W * i + STOP], car[W * i + LINE])
+    if m == ASIDE and room < 2 * v * v * rules[BRAKING] + rules[SETBACK]:
+        car[W * i + STOP] = min(car[W * i + STOP], car[W * i + LINE] if room >= 0 else road[K * k + LONG])
     if m < 0:
         return
     j = tag[W * i + LEADER]

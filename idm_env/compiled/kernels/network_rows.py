@@ -101,7 +101,7 @@ def tables_of(r, sizes, cars, tags, road, site, move, against, routes, others, r
         located(cars.ctypes.data + r * n * W * real, cars), located(tags.ctypes.data + r * n * W * whole, tags),
         located(road.ctypes.data, cars), located(site.ctypes.data, tags), located(move.ctypes.data, tags),
         located(against.ctypes.data, tags), located(routes.ctypes.data, tags), located(others.ctypes.data, tags),
-        located(rules.ctypes.data, cars), located(driver, cars),
+        located(rules.ctypes.data + r * rules.shape[1] * real, cars), located(driver, cars),
     )  # fmt: skip
 
 

@@ -142,7 +142,9 @@ def _rules(stepping: CarFollowingStep, params: Params, state: State) -> tuple[Ar
     )
     values = torch.stack([x.to(like.dtype) for x in full], 1).numpy()
     rules = stop.most_decel, stop.critical_gap, stop.sight, stop.reach, stop.every, 0.5 / stop.most_decel
-    return np.array([*rules, 1.5 * stop.every**2 + 0.3], values.dtype), values  # at 3 m/s² at most
+    longest = state.length.detach().expand(like.shape).amax(-1).reshape(-1, 1).numpy()
+    fixed = np.array([[*rules, 1.5 * stop.every**2 + 0.3]], values.dtype)  # at 3 m/s² at most
+    return np.concatenate((fixed.repeat(len(longest), 0), longest + values.dtype.type(7.0)), 1), values
 
 
 def clocks_of(state: State) -> Array:
