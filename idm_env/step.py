@@ -74,7 +74,7 @@ class CarFollowingStep:
             )
         sideways = next((e.name for e in self.effects if e.hook == "change"), None)
         if sideways and not self.road.beside:
-            raise ValueError(f"effect '{sideways}' changes lanes, and this road has one. Take Lanes(2), or none.")
+            raise ValueError(f"effect '{sideways}' changes lanes: this road has one, or its own rule. Take Lanes(2).")
         parameters.one_of("integration", self.integration, INTEGRATORS)
         if self.decides_in_blocks and self.sees_mergers:
             raise ValueError("who takes turns to decide does not see who signals: leave stagger or that effect out.")

@@ -289,7 +289,7 @@ def top_level() -> set[str]:
         (classes_named_twice, 7),
         (lines_behind_a_step, 2234),
         (lines_of_code, 35028),
-        (lines_of_networks, 3019),
+        (lines_of_networks, 3043),
         (functions_of_many_parameters, 15),
         (high_packages, 1),
         (file_names_twice, 25),

@@ -569,8 +569,7 @@ def network(
         _work_begins()
         result = simulate_network(net, routes, out, seconds=seconds, seed=int(seed), resume=resume, on_progress=report)
     console.print(result["sentence"], soft_wrap=True, highlight=False)
-    skipped = ", ".join(f"{what} {count}" for what, count in result["skipped"].items()) or "nothing was left out"
-    answers.finished(out, f"Data: {skipped}.")
+    answers.finished(out, result["account"])
 
 
 @app.command()

@@ -46,7 +46,7 @@ def simulate_network(
     """
     with storage.results(out, WRITTEN, [net, *routes]):
         on_progress("reading", 0, 0, net.name)
-        network = Network.from_sumo(net)
+        _empty_map(network := Network.from_sumo(net))  # refused before hours of traffic
         demand = Demand.from_sumo(network, *routes, seed=seed, **({} if seconds is None else {"end": seconds}))
         mark = storage.fingerprint(net, *routes, seconds, seed)
         store = storage.Store(out / storage.UNFINISHED / "network", mark, resume)
@@ -133,7 +133,8 @@ class _Traffic:
         ways, dt = junctions.journeys_of(self.state), self.simulator.dt
         used = [row[row >= 0] for row in demand.routes]
         ends = (("from", 0), ("to", -1))
-        trips: dict[str, Any] = {name: [network.edge[used[r][k]] for r in demand.route] for name, k in ends}
+        trips: dict[str, Any] = {"id": demand.names}
+        trips |= {name: [network.edge[used[r][k]] for r in demand.route] for name, k in ends}
         trips["due_s"] = demand.depart
         for name, steps in (("entered_s", ways.entered), ("arrived_s", ways.left)):
             trips[name] = [k * dt if k >= 0 else None for k in steps.tolist()]
@@ -147,12 +148,17 @@ class _Traffic:
         arrived, seconds = trips.drop_nulls("arrived_s"), self.samples * SAMPLE_S
         numbers: dict[str, Any] = {"vehicles": len(trips), "arrived": len(arrived), "seconds": seconds}
         numbers |= {name: arrived[name].mean() for name in ("travel_time_s", "free_time_s")}
+        numbers["deadlocked"] = int(junctions.deadlocked(self.simulator, self.state, self.params))
         sentence = f"{len(arrived)} of {len(trips)} vehicles arrived within {seconds:.0f} s"
         if len(arrived):
             mean, free = numbers["travel_time_s"], numbers["free_time_s"]
             sentence += f", after {mean:.1f} s on average; at the limits their routes take {free:.1f} s"
-        skipped = {**self.network.skipped, **self.demand.skipped}
-        return {"sentence": f"{sentence}.", **numbers, "skipped": skipped, "cautions": self.network.cautions()}
+        if numbers["deadlocked"]:
+            sentence += f"; {numbers['deadlocked']} wait for one another for ever"
+        skipped, cautions = {**self.network.skipped, **self.demand.skipped}, self.network.cautions()
+        account = ", ".join(f"{what} {count}" for what, count in skipped.items()) or "nothing was left out"
+        account = f"Data: {account}." + (f" {len(cautions)} cautions, the first: {cautions[0]}" if cautions else "")
+        return {"sentence": f"{sentence}.", "account": account, **numbers, "skipped": skipped, "cautions": cautions}
 
 
 def _empty_map(network: Network) -> tuple[Any, Any, Any]:

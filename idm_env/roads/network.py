@@ -248,19 +248,34 @@ class Network(Road):
     def ever_open(self, move: int) -> bool:
         """Return whether a move may be made at some time."""
         s = int(self.signal[move])
-        return s < 0 or any(LETTERS[state[self.index[move]]] in (GREEN, YIELD) for state in self.plans[s].states)
+        phases = zip(self.plans[s].states, self.plans[s].durations, strict=True) if s >= 0 else ()
+        letters = (state[self.index[move]] for state, lasts in phases if lasts > 0.0)
+        return s < 0 or any(LETTERS[letter] in (GREEN, YIELD) for letter in letters)
+
+    @cached_property
+    def circles(self) -> list[list[int]]:
+        """Moves without a signal that yield in a circle."""
+        move, place = np.nonzero((self.yields >= 0) & (self.signal < 0)[:, None])
+        first = self.yields[move, place]
+        pairs = np.stack((move, first))[:, self.signal[first] < 0]
+        if not pairs.size:
+            return []
+        from scipy.sparse import coo_array, csgraph  # takes a second
+
+        graph = coo_array((np.ones(pairs.shape[1]), pairs), (len(self.start), len(self.start)))
+        parts = csgraph.connected_components(graph, connection="strong")[1]
+        return [np.flatnonzero(parts == k).tolist() for k in np.flatnonzero(np.bincount(parts) > 1)]
 
     def cautions(self) -> tuple[str, ...]:
         """Return, a line each, what may come to a standstill: moves that yield in a circle, or foes of equal right."""
-        free = np.flatnonzero(self.signal < 0).tolist()
-        after = {m: set(self.yields[m].tolist()) & set(free) for m in free}
-        lines = []
-        for circle in _circles(after):
+        free, lines = self.signal < 0, []
+        for circle in self.circles:
             names = ", ".join(map(self.move_name, circle))
             lines.append(f"moves {names} yield in a circle, and may block one another.")
-        for m in free:
+        for m in np.flatnonzero(free).tolist():
             for f in self.foes[m].tolist():
-                if f > m and f in after and f not in after[m] and m not in after[f] and self.start[f] != self.start[m]:
+                equal = f > m and free[f] and f not in self.yields[m] and m not in self.yields[f]
+                if equal and self.start[f] != self.start[m]:
                     lines.append(f"moves {self.move_name(m)} and {self.move_name(f)} cross, and neither goes first.")
         return tuple(lines)
 
@@ -366,14 +381,3 @@ def _check_plans(net: Network) -> None:
             for m in mine[(net.index[mine] < 0) | (net.index[mine] >= len(state))]:
                 shows = f"move {net.move_name(m)} is shown number {net.index[m]}, from 0 on"
                 raise ValueError(f"{who}: state {shown(state)} has {len(state)} letters, and {shows}.")
-
-
-def _circles(after: Mapping[int, set[int]]) -> list[list[int]]:
-    """Return the parts of a graph within which everything leads to everything else, those of more than one."""
-    from scipy.sparse import coo_array, csgraph  # takes a second
-
-    pairs = np.array([(a, b) for a, others in after.items() for b in others], int).reshape(-1, 2)
-    n = max(after, default=-1) + 1
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (n, n))
-    parts = csgraph.connected_components(graph, connection="strong")[1] if n else np.zeros(0)
-    return [np.flatnonzero(parts == k).tolist() for k in np.flatnonzero(np.bincount(parts.astype(int)) > 1)]

@@ -20,7 +20,8 @@ class Demand:
 
     ``routes`` (R, H) are lists of links, those inside junctions included, filled with −1. A vehicle follows ``route``
     (n), is due at ``depart`` (n, s) at the beginning of its first link, asks there for ``speed`` (n, m/s), has
-    ``length`` (n, m) and is of a ``kind`` (n): a row of ``kinds``, which map ``effect.parameter`` to a value.
+    ``length`` (n, m) and is of a ``kind`` (n): a row of ``kinds``, which map ``effect.parameter`` to a value. Those
+    of files have ``names``; SUMO numbers those of flows in this way, too.
 
     ValueError, in one line, for numbers that no vehicle has.
     """
@@ -32,6 +33,7 @@ class Demand:
     length: Array = field(default_factory=lambda: np.array(5.0))
     kind: Array = field(default_factory=lambda: np.array(0))
     kinds: tuple[Mapping[str, float], ...] = ({},)
+    names: tuple[str, ...] = ()
     skipped: Mapping[str, int] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -43,6 +45,7 @@ class Demand:
             columns[name] = np.broadcast_to(x.reshape(-1) if x.ndim else x, (n,))
         order = np.argsort(columns["depart"], kind="stable")
         object.__setattr__(self, "routes", routes)
+        object.__setattr__(self, "names", tuple(self.names[i] for i in order) if self.names else ())
         for name, x in columns.items():
             object.__setattr__(self, name, x[order])
         for name, count in whole.items():

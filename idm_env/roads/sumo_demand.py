@@ -46,6 +46,8 @@ READ["vehicle"] = {"id", "type", "depart", "departSpeed", "route", "color"}
 READ["trip"] = READ["vehicle"] | {"from", "to", "via"}
 READ["flow"] = READ["trip"] | {"begin", "end", "number", "vehsPerHour", "perHour", "period", "probability"}
 """Attributes that are read, or that change nothing; all others are counted."""
+AS_IT_IS = {("departPos", "0"), ("departPos", "base"), ("delta", "4"), ("delta", "4.0")}
+"""What is so without being said."""
 
 
 def read_demand(network: Network, paths: Sequence[Path], seed: int, end: float) -> dict[str, Any]:
@@ -69,7 +71,7 @@ class _Reader:
         self.kinds: list[dict[str, float]] = []
         self.known: dict[str, dict[str, list[tuple[float, Any]]]] = {"vType": {}, "route": {}}
         self.numbers: dict[Route, int] = {}
-        self.rows: list[tuple[int, float, float, float, int]] = []
+        self.rows: list[tuple[int, float, float, float, int, str]] = []
         self.drivers: dict[tuple[int, float], int] = {}
         self.ids: set[str] = set()
 
@@ -91,11 +93,13 @@ class _Reader:
             weight, many = number(element, "probability", 1.0, 0.0), self.variants if kind == "route" else 1
             pairs = [(weight, make(element, owner or name(element))) for _ in range(many)]
         else:
-            keys = element.get(f"{kind}s", "").split()
+            keys, pairs = element.get(f"{kind}s", "").split(), []
             weights = element.get("probabilities", "1 " * len(keys)).split()
             if len(keys) != len(weights):
                 raise ValueError(f"{name(element)}: {len(weights)} probabilities for {len(keys)} names. Give one each.")
-            pairs = [(float(w), self._named(kind, key, element)[0][1]) for key, w in zip(keys, weights, strict=True)]
+            for key, weight in zip(keys, weights, strict=True):
+                own = Element(element.tag, element.attrib | {"probabilities": weight})
+                pairs.append((number(own, "probabilities", None, 0.0), self._named(kind, key, element)[0][1]))
             pairs += [pair for each in element.iter(kind) for pair in self._choices(each, kind, owner)]
         if not sum(weight for weight, _ in pairs) > 0.0:
             raise ValueError(f"{name(element)} has nothing of a probability above 0. Give it some.")
@@ -129,8 +133,10 @@ class _Reader:
         return self.kinds.index(kind), number(element, "length", length, 0.1), _spread(element, vehicle_class)
 
     def _count_unread(self, element: Element) -> None:
-        for key in {*dict(element.attrib.items() - {("departPos", "0"), ("departPos", "base")})} - READ[element.tag]:
+        for key in {*dict(element.attrib.items() - AS_IT_IS)} - READ[element.tag]:
             self.skipped[f"attribute {key} of {element.tag}"] += 1
+        for child in element if element.tag == "vType" else ():
+            self.skipped[f"elements <{child.tag}> of vType"] += 1
 
     # -- vehicles ----------------------------------------------------------------------------------------------------
 
@@ -145,7 +151,7 @@ class _Reader:
             self._choices(Element("vType", id=key), "vType")
         types, routes = self._named("vType", key, element), self._routes_of(element)
         random, shares = keyed(self.seed, own), keyed(self.seed, f"{own} speedFactor")
-        for depart in self._departures(element, random) if routes else ():
+        for count, depart in enumerate(self._departures(element, random) if routes else ()):
             one, route = _choose(types, random), _choose(routes, random)
             if one is None:
                 self.skipped[f"vehicles of type {key}, which is no car's"] += 1
@@ -155,7 +161,8 @@ class _Reader:
                 continue
             speed = self._entry_speed(element, self.kinds[one[0]]["idm.desired_speed"], self.limit[route[0]], random)
             kind = self._driver(one[0], round(_draw_share(one[2], shares), 3))
-            self.rows.append((self.numbers.setdefault(route, len(self.numbers)), depart, speed, one[1], kind))
+            vehicle = f"{own}.{count}" if element.tag == "flow" else own
+            self.rows.append((self.numbers.setdefault(route, len(self.numbers)), depart, speed, one[1], kind, vehicle))
             if len(self.rows) > MOST_VEHICLES:
                 raise ValueError(f"{name(element)} brings more than {MOST_VEHICLES} vehicles. Give it fewer.")
 
@@ -224,7 +231,8 @@ class _Reader:
 
     def columns(self) -> dict[str, Any]:
         """Return the columns of ``Demand``."""
-        columns = dict(zip(("route", "depart", "speed", "length", "kind"), zip(*self.rows, strict=True), strict=False))
+        names = "route", "depart", "speed", "length", "kind", "names"
+        columns = dict(zip(names, zip(*self.rows, strict=True), strict=False))
         if not columns:
             raise ValueError("the files of demand have no vehicle. Give vehicles, trips or flows.")
         return columns | {"routes": padded(list(self.numbers)), "kinds": tuple(self.kinds), "skipped": +self.skipped}

@@ -59,7 +59,8 @@ class JunctionTask(NetworkTask):
         agents: Most vehicles that are agents at once.
         circling: Number of vehicles of a network without entries, such as the figure eight, which enter at first.
         max_command: Deceleration that an action of −1 adds (m/s²).
-        trips: A SUMO ``.rou.xml`` of that network's edges, or None: vehicles arrive at random where links begin.
+        trips: A SUMO ``.rou.xml`` of that network's edges, the same demand in every episode and world, or None:
+            vehicles arrive at random where links begin.
         inflow: Vehicles per hour and entry where there are no ``trips``.
         turns: Shares of those who turn left, go on and turn right.
         duration: Length of an episode (s).

@@ -41,7 +41,8 @@ class SignalsTask(NetworkTask):
 
     Args:
         network: ``"grid 5x5"`` (rows × columns), ``"grid 5x5x2"`` of two lanes, a SUMO ``.net.xml``, or a ``Network``.
-        trips: A SUMO ``.rou.xml`` of that network's edges, or None: vehicles arrive at random where links begin.
+        trips: A SUMO ``.rou.xml`` of that network's edges, the same demand in every episode and world, or None:
+            vehicles arrive at random where links begin.
         inflow: Vehicles per hour and entry where there are no ``trips``.
         turns: Shares of those who turn left, go on and turn right. On one lane few who wait for a gap to turn left stop
             all behind them.

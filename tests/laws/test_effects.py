@@ -210,7 +210,7 @@ def test_without_neighbours_an_effect_of_neighbours_is_exactly_absent(name: str)
 @pytest.mark.parametrize("road", [Lane(), Ring(), Lanes(1)], ids=["lane", "ring", "lanes"])
 def test_on_one_lane_effects_that_change_lanes_are_refused(name: str, road: Road) -> None:
     """There is nowhere to go."""
-    with pytest.raises(ValueError, match=f"effect '{name}' changes lanes, and this road has one"):
+    with pytest.raises(ValueError, match=f"effect '{name}' changes lanes: this road has one"):
         around(make(name), road)
 
 

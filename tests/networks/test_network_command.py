@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,9 @@ def test_its_files_agree(files: tuple[Path, Path], tmp_path: Path, monkeypatch: 
     rows = tables(tmp_path)
     trips, times = rows["trips"], rows["over_time"]
     assert result["vehicles"] == result["arrived"] == len(trips) == 35
+    assert sorted(trips["id"]) == sorted([*(f"a.{k}" for k in range(25)), *(f"b.{k}" for k in range(10))])
+    first = trips.filter(pl.col("id") == "b.1").row(0, named=True)
+    assert (first["from"], first["due_s"]) == ("bottom0A0", 30.0)
     assert (trips["travel_time_s"] >= trips["free_time_s"]).all()
     assert (trips["arrived_s"] - trips["due_s"] - trips["travel_time_s"]).abs().max() <= 0.1
     assert result["travel_time_s"] == pytest.approx(trips["travel_time_s"].mean())
@@ -60,6 +64,33 @@ def test_its_files_agree(files: tuple[Path, Path], tmp_path: Path, monkeypatch: 
         assert np.asarray(drawn.convert("RGB")).std() > 5.0
         assert getattr(moving, "n_frames", 1) > 10
     assert "Longest queues" in (tmp_path / "report.html").read_text()
+
+
+def test_a_standstill_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four streams go round a block of short roads, which they fill."""
+    monkeypatch.setattr(network_job, "FRAMES", 4)
+    net = write_net(tmp_path / "my.net.xml", Network.grid(2, 2, block=40.0, arm=60.0, control="priority"))
+    block = ["A0B0", "B0B1", "B1A1", "A1A0"]
+    ends = [("left0A0", "A1left1"), ("bottom1B0", "A0bottom0"), ("right1B1", "B0right0"), ("top0A1", "B1top1")]
+    ways = [[ends[k][0], *(block[(k + i) % 4] for i in range(3)), ends[k][1]] for k in range(4)]
+    flows = [
+        f'<flow id="{k}" begin="0" end="60" period="4"><route edges="{" ".join(way)}"/></flow>'
+        for k, way in enumerate(ways)
+    ]
+    (tmp_path / "my.rou.xml").write_text(f"<routes>{''.join(flows)}</routes>")
+    result = simulate_network(net, [tmp_path / "my.rou.xml"], tmp_path / "out", seconds=200.0)
+    assert result["arrived"] < 60 and result["deadlocked"] > 3
+    assert f"; {result['deadlocked']} wait for one another for ever." in result["sentence"]
+
+
+def test_a_network_without_shapes_is_refused_at_once(files: tuple[Path, Path], tmp_path: Path) -> None:
+    """A map needs them, and comes last."""
+    bare = tmp_path / "bare.net.xml"
+    bare.write_text(re.sub(r' shape="[^"]*"', "", files[0].read_text()))
+    phases: list[str] = []
+    with pytest.raises(ValueError, match=r"^link '.*' has no shape, and a map needs one\. Give every lane a shape\.$"):
+        simulate_network(bare, [files[1]], tmp_path / "out", on_progress=lambda phase, *_: phases.append(phase))
+    assert set(phases) == {"reading"}
 
 
 def test_an_interrupted_run_goes_on(files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -115,7 +115,8 @@ def test_limits_are_driven_by_shares_of_the_given_spread(
 
 def test_what_is_not_traffic_of_cars_is_counted(tmp_path: Path) -> None:
     demand = read(
-        '<vType id="t" carFollowModel="IDM" sigma="0" speedDev="0.1"/><vType id="walk" vClass="pedestrian"/>'
+        '<vType id="t" carFollowModel="IDM" delta="4" sigma="0" speedDev="0.1"><param key="k" value="1"/></vType>'
+        '<vType id="walk" vClass="pedestrian"/>'
         '<person id="p"/><busStop id="s"/><trip id="z" fromTaz="1" toTaz="2" depart="0"/>'
         f'<vehicle id="w" type="walk" depart="0"><route edges="{WAY}"/></vehicle>'
         f'<vehicle id="v" type="t" depart="0" departLane="best"><route edges="{WAY}"/><stop lane="x"/></vehicle>'
@@ -128,7 +129,7 @@ def test_what_is_not_traffic_of_cars_is_counted(tmp_path: Path) -> None:
         "attribute sigma of vType": 1, "vTypes of Krauss driven by IDM": 2,
         "elements <person>": 1, "elements <busStop>": 1, "trips between districts or junctions": 1,
         "vehicles of type walk, which is no car's": 1, "attribute departLane of vehicle": 1,
-        "elements <stop> of vehicle": 2,
+        "elements <stop> of vehicle": 2, "elements <param> of vType": 1,
         "vehicles that depart when triggered": 1, "attribute fromTaz of trip": 1, "attribute toTaz of trip": 1,
     }  # fmt: skip
 
@@ -158,6 +159,7 @@ def test_what_is_not_traffic_of_cars_is_counted(tmp_path: Path) -> None:
         ('<flow id="f" from="left0A0" to="A0B0" period="1e-9"/>', '<flow id="f"> brings more than 5000000 vehicles'),
         ('<flow id="f" from="left0A0" to="A0B0" period="exp(x)"/>', "<flow id=\"f\">: period = 'x' must be a number"),
         ('<vTypeDistribution id="d" vTypes="a b" probabilities="1"/>', "1 probabilities for 2 names"),
+        ('<vTypeDistribution id="d" vTypes="a" probabilities="x"/>', "id=\"d\">: probabilities = 'x' must be a number"),
         ('<routeDistribution id="d"/>', '<routeDistribution id="d"> has nothing of a probability above 0'),
     ],
 )  # fmt: skip

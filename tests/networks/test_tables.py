@@ -68,11 +68,12 @@ def test_bad_demand_names_its_element(values: dict[str, Any], text: str) -> None
 
 
 def test_a_move_in_use_must_be_green_at_some_time() -> None:
-    """Nobody waits for ever."""
-    network = Network.from_tables(LINKS, MOVES, (Plan("s", (30.0, 3.0), ("r", "y")),))
-    Demand([[3, 4, 2]], [0], [0.0]).check(network)
-    with pytest.raises(ValueError, match=r"route 0: signal 's' never shows green to move a→b"):
-        Demand([[0, 1, 2]], [0], [0.0]).check(network)
+    """Nobody waits for ever, nor for a green of 0 s."""
+    for durations, states in (((30.0, 3.0), ("r", "y")), ((0.0, 30.0), ("G", "r"))):
+        network = Network.from_tables(LINKS, MOVES, (Plan("s", durations, states),))
+        Demand([[3, 4, 2]], [0], [0.0]).check(network)
+        with pytest.raises(ValueError, match=r"route 0: signal 's' never shows green to move a→b"):
+            Demand([[0, 1, 2]], [0], [0.0]).check(network)
 
 
 def test_what_may_block_itself_is_told() -> None:

@@ -44,8 +44,8 @@ TIME_GAP, LEAST, BRAKE, ACCEL_OF = range(4)
 W, K = 16, 8
 """Columns of vehicles, and of links and moves: what one needs is on two lines of a cache. Tables are handed on as
 pointers: numba counts references to arrays at every call, which costs more than most of what is done here."""
-NONE, GATED, ASIDE = -1, -2, -2
-"""No move; a gate at the end; the next that comes is no gate, but a change to the lane beside."""
+NONE, GATED, ASIDE, CIRCLE = -1, -2, -2, -2
+"""No move; a gate at the end; what comes next is no gate, but a change of lanes; no signal, and yields in a circle."""
 RED, GREEN, AMBER, YIELD = range(4)
 FREE, STOPS, CLEARS = range(3)
 """What a driver is told: nothing; to stop; and that he counts as inside, so that in red he goes before his foes."""
@@ -448,8 +448,8 @@ def is_closed(m, move):
 def look_ahead(i, sizes, car, tag, road, site, move, routes, rules, driver):
     """Note whether a vehicle is about to arrive; what he has reserved ends where it is closed and he can stop.
 
-    Nobody arrives behind somebody who stands before the line, or who stands because he cannot leave the junction. In
-    amber and red those alone arrive who count as inside.
+    Nobody arrives behind somebody who stands before the line, or who stands because he cannot leave the junction, or to
+    yield, where all might wait in a circle. In amber and red those alone arrive who count as inside.
     Before a link of a lower limit he brakes as before a closed line, until he is as slow.
     """
     v, k, m, room = car[W * i + SPEED], tag[W * i + LINK], tag[W * i + GATE], car[W * i + LINE] - car[W * i + POSITION]
@@ -462,6 +462,7 @@ def look_ahead(i, sizes, car, tag, road, site, move, routes, rules, driver):
         return
     j = tag[W * i + LEADER]
     stuck = j != i and car[W * j + SPEED] < STANDS and car[W * i + BASE] + car[W * j + POSITION] < car[W * i + LINE]
+    stuck = stuck or (v < STANDS and tag[W * i + TOLD] > FREE and move[K * m + SIGNAL] == CIRCLE)
     near = room < rules[CRITICAL_GAP] * max(v, STANDS) and not stuck
     ends = tag[W * i + TOLD] < CLEARS and is_closed(m, move)
     if near and not ends and (v >= STANDS or has_room(i, m, sizes, car, tag, road, site, move, routes, driver)):

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from idm_env.compiled.kernels import lanes, network_rows, threads as pool, tiles
 from idm_env.compiled.kernels.memory import addresses
-from idm_env.compiled.kernels.network_loops import CAR, GATED, TAG, K, W
+from idm_env.compiled.kernels.network_loops import CAR, CIRCLE, GATED, TAG, K, W
 from idm_env.compiled.kernels.network_rows import LEADS, LED, Operands
 from idm_env.compiled.kernels.operands import operand, table
 from idm_env.compiled.kernels.printed import TileKernel, tile_kernel
@@ -122,6 +122,8 @@ def _tables(network: Network, kind: np.dtype) -> tuple[Any, ...]:
     site[network.start[gated], 0], site[network.path[gated, 0], 0] = GATED, gated
     move = np.zeros((moves, K), np.int32)
     move[:, :4] = np.stack((network.start, network.end, network.signal, network.index), 1)
+    for circle in network.circles:
+        move[circle, 2] = CIRCLE
     against = np.full((2, moves, max(network.foes.shape[1], network.yields.shape[1])), -1, np.int32)
     against[0, :, : network.foes.shape[1]], against[1, :, : network.yields.shape[1]] = network.foes, network.yields
     shows, first = network.shows
