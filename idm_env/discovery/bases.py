@@ -54,15 +54,18 @@ class Law(NamedTuple):
         return f"{title} with own strengths" if self.own else title
 
     @property
+    def is_ahead(self) -> bool:
+        """Whether it predicts 5 s ahead better than the null beyond chance."""
+        return self.against["horizon_rmse_m"].outcome is ErrorChange.BETTER
+
+    @property
     def is_better(self) -> bool:
         """Whether it holds as an addition must, and all errors are lower by ``LEAST`` on the whole.
 
         With more parameters of the drivers' own it must predict 5 s ahead better beyond chance: in closed loop these
         may only spread a driver's noise over more of them.
         """
-        if self.own and self.against["horizon_rmse_m"].outcome is not ErrorChange.BETTER:
-            return False
-        return lowers(self.against)
+        return (self.is_ahead or not self.own) and lowers(self.against)
 
     @property
     def mean_ratio(self) -> float:
@@ -99,10 +102,11 @@ def compared(
 
     for law in others:
         add(Hypothesis(null.terms, Catalogue(named, law, located=False)))
-    # Whether a part of a better law does the work, or all of it, is told beside it.
+    # Whether a part of a law does the work, or all of it, is told beside it.
+    for each in laws[1:]:
+        for name in each.law.spared if each.is_ahead or each.is_better else ():
+            add(Hypothesis(null.terms, replace(each.model.catalogue, without=(name,))))
     better = best_of(laws)
-    for name in better.law.spared if better.against else ():
-        add(Hypothesis(null.terms, replace(better.model.catalogue, without=(name,))))
     # A better law comes first: what it lacks is sought, before anything is put down to its drivers.
     add(personal(null, own))
     if laws[-1].is_better and not better.against:

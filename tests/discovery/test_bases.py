@@ -13,7 +13,7 @@ import torch
 from idm_env.data import synthetic
 from idm_env.discovery import bases, discover, page, write_report
 from idm_env.discovery.calibrate import first_prior
-from idm_env.discovery.compare import ERRORS
+from idm_env.discovery.compare import ERRORS, Comparison
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
@@ -126,6 +126,29 @@ def test_linear_controllers_have_their_law_and_what_it_lacks(effect: str | None,
         assert page.cards(found.result, "IDM")[0][1] == "better", "the first screen is of the law"
 
 
+def error(ratio: float) -> dict[str, Comparison]:
+    """Return how all errors compare with the null's, sure to within 1 %."""
+    return dict.fromkeys(ERRORS, Comparison(1.0, ratio, ratio, ratio - 0.01, ratio + 0.01))
+
+
+@pytest.mark.parametrize("ratio", [0.9, 1.1])
+def test_what_the_parts_of_a_law_do_is_told_beside_it_where_another_law_is_the_best(
+    ratio: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a law that predicts better 5 s ahead: else its parts do nothing that would have to be told."""
+    asked: list[tuple[str, ...]] = []
+    ratios = {"iidm": 0.5, "constant_time_gap": ratio}
+
+    def judged(model: Hypothesis) -> Judged:
+        asked.append(model.catalogue.without)
+        return cast(Any, model.catalogue.base.kind)
+
+    monkeypatch.setattr(bases, "compare", lambda _, kind, __: error(ratios.get(kind, 1.2)))
+    laws = bases.compared(Hypothesis(), cast(Any, "idm"), judged, 0, lambda *_: None)
+    assert bases.best_of(laws).law.kind == "iidm"
+    assert [parts for parts in asked if parts] == ([("feed_forward",), ("lag",)] if ratio < 1.0 else [])
+
+
 @pytest.mark.parametrize("helps", [True, False])
 def test_own_strengths_are_tried_on_every_law_alike_where_they_help(
     helps: bool, monkeypatch: pytest.MonkeyPatch
@@ -137,7 +160,7 @@ def test_own_strengths_are_tried_on_every_law_alike_where_they_help(
         asked.append((model.catalogue.base.kind, bool(model.catalogue.personal)))
         return cast(Any, "errors")
 
-    monkeypatch.setattr(bases, "compare", lambda *_: {})
+    monkeypatch.setattr(bases, "compare", lambda *_: error(1.2))
     monkeypatch.setattr(bases.Law, "is_better", property(lambda law: helps and bool(law.own)))
     bases.compared(null, cast(Any, "errors"), judged, 0, lambda *_: None)
     own = [kind for kind, personal in asked if personal]
