@@ -9,18 +9,18 @@ from idm_env.discovery.march import CURVE
 from idm_env.discovery.model import Term
 from idm_env.discovery.result import ParameterEstimate
 from idm_env.discovery.slots import TARGETS
-from idm_env.discovery.words import ALONG, CHANGES
+from idm_env.discovery.words import ALONG, CHANGES, noun_of
 from idm_env.effects.free import FEATURES, PER
 
 
 def source(terms: Sequence[tuple[Term, Mapping[str, ParameterEstimate]]], sentence: str) -> str:
-    """Return the text of a file with one effect for every curve over a state, "" where there is none.
+    """Return the text of a file with one effect for every curve over a state or a phase, "" where there is none.
 
     Args:
         terms: What was added, and the estimates of its parameters by name.
         sentence: What is said of it.
     """
-    curves = [(t, p) for t, p in terms if t.located and t.form == CURVE and t.fades]
+    curves = [(t, p) for t, p in terms if t.located and t.form == CURVE and (t.fades or t.cycles)]
     if not curves:
         return ""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -33,19 +33,17 @@ def source(terms: Sequence[tuple[Term, Mapping[str, ParameterEstimate]]], senten
     return environment.get_template(template.name).render(sentence=sentence, classes=classes)
 
 
-def _name(term: Term) -> str:
-    return "".join(word.capitalize() for word in _kind(term).split("_"))
-
-
 def _kind(term: Term) -> str:
-    return f"{term.what}_over_{term.coordinate}" + (f"_by_{term.by}" if term.by else "")
+    return f"{term.what}_over_{'phase' if term.cycles else term.coordinate}" + (f"_by_{term.by}" if term.by else "")
 
 
 def _class(term: Term, estimates: Mapping[str, ParameterEstimate]) -> dict[str, Any]:
     """Return the names and values of a curve that the template takes."""
     first, distance, count = term.drawn
-    heights = ", ".join(("0.0 * x", *(f'p["{p.name}"]' for p in term.parameters), "0.0 * x"))
+    end = ["0.0 * x"] * term.fades
+    heights = ", ".join((*end, *(f'p["{p.name}"]' for p in term.parameters), *end))
     factors = ", ".join(f"{n}=driver.{n} * (1.0 + c)" for n in TARGETS.get(term.what, ()))
-    own = {"term": term, "name": _name(term), "kind": _kind(term), "estimates": estimates, "heights": heights}
-    own |= {"changed": CHANGES[term.what], "along": ALONG, "units": FEATURES, "per": PER, "factors": factors}
-    return own | {"knots": tuple(float(f"{first + distance * i:.8g}") for i in range(count))}
+    name = "".join(word.capitalize() for word in _kind(term).split("_"))
+    own = {"term": term, "name": name, "kind": _kind(term), "estimates": estimates, "heights": heights}
+    own |= {"changed": CHANGES[term.what], "along": ALONG, "noun": noun_of(term), "units": FEATURES, "per": PER}
+    return own | {"factors": factors, "knots": tuple(float(f"{first + distance * i:.8g}") for i in range(count))}

@@ -66,6 +66,11 @@ class Term:
         """Whether this is a curve over a feature of the past."""
         return self.located and self.coordinate in HISTORY
 
+    @property
+    def cycles(self) -> bool:
+        """Whether this is a curve over the phase of a period."""
+        return self.located and self.coordinate == "time" and self.period > 0.0
+
     def entries(self, catalogue: Catalogue, table: str) -> list[int]:
         """Return the places in φ of the parameters; ``table`` is the effect's or the slot's."""
         if self.form == march.NONE or self.profile is not None:

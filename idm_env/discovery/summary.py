@@ -217,7 +217,7 @@ def _where(term: Term, values: dict[str, float]) -> result.Location:
         profile = None
         if term.effect is not None and ALL[term.effect].sought == "profile" and term.profile is None:
             profile = {"position_m": [first + distance * i for i in range(term.size)]}
-        coordinate = "period" if "phase" in term.label else term.coordinate
+        coordinate = "period" if term.cycles else term.coordinate
         return result.Location(coordinate, (first, first + distance * (count - 1)), profile)
     return result.Location("state" if term.coordinate in ("", "state") else term.coordinate, (None, None))
 

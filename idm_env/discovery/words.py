@@ -109,7 +109,7 @@ def clause(term: Term, values: Sequence[Sequence[float]], contrast: Contrast | N
     if contrast is not None:
         return f"the {noun} {_contrast(term, estimates, contrast)} ({equation}, with {numbers})"
     if len(values) > MANY or term.knots[2] > 2:
-        return f"the {noun} depends on {_over(term)} ({equation}, with {numbers})"
+        return f"the {noun} depends on the {noun_of(term)} ({equation}, with {numbers})"
     if len(values) == 2:
         return f"the {noun} drifts over {ALONG[term.coordinate]} ({equation}, with {numbers})"
     text = below if estimates[0] < 0 else above
@@ -127,7 +127,7 @@ def _contrast(term: Term, estimates: Sequence[float], c: Contrast) -> str:
         below = 1.0 + estimates[c.low_knot]
         difference = f"{100 * c.estimate / below:.0f} % [{100 * c.low / below:.0f}, {100 * c.high / below:.0f}] higher"
     where = f"{amount(high, unit)} than at {amount(low, unit)}"
-    if "phase" in term.label:
+    if term.cycles:
         where += f" of a cycle of {term.period:.0f} s"
     prefix = f"a {ALONG[term.coordinate]} of " if term.fades else ""
     if term.by:
@@ -135,10 +135,9 @@ def _contrast(term: Term, estimates: Sequence[float], c: Contrast) -> str:
     return f"is {difference} at {prefix}{where}".replace("[-", "[−")
 
 
-def _over(term: Term) -> str:
-    if "phase" in term.label:
-        return f"the phase of a cycle of {term.period:.0f} s"
-    return f"the {ALONG[term.coordinate]}"
+def noun_of(term: Term) -> str:
+    """Return the noun of what a curve runs over."""
+    return f"phase of a cycle of {term.period:.0f} s" if term.cycles else ALONG[term.coordinate]
 
 
 def _interval(term: Term, estimates: Sequence[float]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import product
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -20,7 +21,9 @@ from idm_env.discovery.result import ParameterEstimate
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.effects.free import HISTORY, PER
 from idm_env.effects.registry import read
-from idm_env.model_file import load_model
+from idm_env.fitting.job import fit_file
+from idm_env.fitting.options import Options, Source
+from idm_env.model_file import Model, load_model, save_model
 from idm_env.reports.undecided import FOUND
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
@@ -96,6 +99,14 @@ def test_a_model_may_name_the_file(closing: Discovery, tmp_path: Path) -> None:
     assert [e.name for e in load_model(tmp_path / "model.yaml").effects][1] == "time_gap_over_closing_speed"
 
 
+def written(term: terms.Term, heights: np.ndarray, kind: str, folder: Path) -> str:
+    """Return ``file:Class`` of a curve that is written as a file, with its heights as estimates."""
+    each = zip(term.parameters, heights, strict=True)
+    told = {p.name: ParameterEstimate(p.symbol, float(x), 0.0, 1.0, p.unit) for p, x in each}
+    (folder / FOUND).write_text(found.source([(term, told)], "A sentence."), encoding="utf-8")
+    return f"{folder / FOUND}:{''.join(word.capitalize() for word in kind.split('_'))}"
+
+
 EVERY = [*product(PULSED, [c for c in terms.STATES if c not in HISTORY], ("", *PER)), *product(PULSED, HISTORY, [""])]
 
 
@@ -105,13 +116,7 @@ def test_every_shape_is_the_same_in_its_file_and_in_the_model(
 ) -> None:
     term = terms.curve(what, coordinate, 0.5, terms.STATES[coordinate], 3, by=by)
     heights = np.array([0.3, -0.2, 0.4])
-    told = {p.name: ParameterEstimate(p.symbol, float(x), 0.0, 1.0, p.unit)
-            for p, x in zip(term.parameters, heights, strict=True)}  # fmt: skip
-    path = tmp_path / FOUND
-    path.write_text(found.source([(term, told)], "A sentence."), encoding="utf-8")
-    kind = f"{what}_over_{coordinate}" + (f"_by_{by}" if by else "")
-    name = "".join(word.capitalize() for word in kind.split("_"))
-    of_file = read(f"{path}:{name}")()
+    of_file = read(written(term, heights, f"{what}_over_{coordinate}" + (f"_by_{by}" if by else ""), tmp_path))()
     of_model, numbers = terms.effects_of(Hypothesis((term,)), heights)
     random = np.random.default_rng(0)
     position = torch.from_numpy(np.cumsum(random.uniform(-40.0, -7.0, 60)))
@@ -134,7 +139,74 @@ def test_every_shape_is_the_same_in_its_file_and_in_the_model(
     assert (mine - accelerations((), {})).abs().max() > 1e-6
 
 
-def test_what_has_a_place_or_a_time_is_no_file() -> None:
-    place = terms.interval("time_gap", "position", 700.0, 1000.0, 0.4)
+def phase(what: str) -> tuple[terms.Term, np.ndarray]:
+    """Return a curve over the phase of a cycle of 6 s, and its heights."""
+    term = terms.curve(what, "time", 0.0, 0.75, 8, 6.0, label=f"{what} over phase")
+    return term, 0.4 * np.sin(np.arange(8.0))
+
+
+@pytest.mark.parametrize("what", PULSED)
+def test_a_cycle_goes_by_the_clock_in_its_file_as_in_the_model(what: str, tmp_path: Path) -> None:
+    """In a simulator, and in the compiled steps of an environment, over several cycles."""
+    term, heights = phase(what)
+    of_file = read(written(term, heights, f"{what}_over_phase", tmp_path))()
+    of_model, numbers = terms.effects_of(Hypothesis((term,)), heights)
+    position, speed = torch.arange(0.0, -300.0, -15.0, dtype=torch.float64), torch.linspace(2.0, 12.0, 20).double()
+
+    def accelerations(*effects: Effect) -> torch.Tensor:
+        simulator = Simulator(Lane(), (IDM(), *effects, Brakes()))
+        params = simulator.defaults(dtype=torch.float64)
+        params |= {
+            effect.name: {k: torch.tensor(x, dtype=torch.float64) for k, x in numbers[effect.name].items()}
+            for effect in effects if effect.name in numbers
+        }  # fmt: skip
+        state = simulator.state(position, speed, params)
+        clock = torch.arange(0, 150, 4)
+        return torch.stack([simulator.acceleration(state._replace(step=step), {}, params) for step in clock])
+
+    mine = accelerations(of_file)
+    assert torch.allclose(mine, accelerations(*of_model), rtol=0.0, atol=1e-9)
+    assert torch.allclose(mine[:-15], mine[15:], rtol=0.0, atol=1e-9), "60 steps are a cycle"
+    assert (mine.amax(0) - mine.amin(0)).max() > 0.05
+
+    def speeds(effects: list[Effect], given: dict[str, dict[str, float]]) -> np.ndarray:
+        ring = {"task": "ring", "vehicles": 8, "length": 160.0, "warmup": 0, "dtype": "float64"}
+        env = gymnasium.make("DiffIDM-v0", **ring, effects=effects, parameters=given)
+        env.reset(seed=3)
+        return np.array([env.step(None)[0] for _ in range(90)])
+
+    there = speeds([of_file], {})
+    np.testing.assert_allclose(there, speeds(list(of_model), numbers), rtol=0.0, atol=1e-6)
+    assert np.abs(there - speeds([], {})).max() > 1e-4
+
+
+def test_a_fit_keeps_the_file_of_a_cycle(tmp_path: Path) -> None:
+    """``fit --model``: drivers are fitted beside it, on the clock of the record."""
+    term, heights = phase("time_gap")
+    path = written(term, heights, "time_gap_over_phase", tmp_path)
+    of_model, numbers = terms.effects_of(Hypothesis((term,)), heights)
+    models = [Model((IDM(), read(path)(), Brakes())), Model((IDM(), *of_model, Brakes()), numbers)]
+    data = tmp_path / "platoon.csv"
+    synthetic.generate(1, runs=1, followers=1, seconds=40.0)[0].table.drop("gap_m", strict=False).write_csv(data)
+    fitted = []
+    for number, model in enumerate(models):
+        save_model(tmp_path / f"{number}.yaml", model)
+        options = Options(starts=1, model=str(tmp_path / f"{number}.yaml"))
+        fit_file(Source(data), options, tmp_path / str(number))
+        fitted.append(load_model(tmp_path / str(number) / "model.yaml"))
+    assert fitted[0].effects[1].name == "found_time_gap_over_phase"
+    mine, theirs = (model.parameters["idm"] for model in fitted)
+    assert mine == pytest.approx(theirs, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        terms.interval("time_gap", "position", 700.0, 1000.0, 0.4),
+        terms.curve("time_gap", "position", 0.0, 90.0, 4, 360.0),
+    ],
+    ids=["interval", "lap"],
+)
+def test_what_has_a_place_is_no_file(place: terms.Term) -> None:
     told = {p.name: ParameterEstimate(p.symbol, 0.1, 0.0, 1.0, p.unit) for p in place.parameters}
     assert found.source([(place, told)], "A sentence.") == ""
