@@ -54,9 +54,9 @@ class Law(NamedTuple):
         return f"{title} with own strengths" if self.own else title
 
     @property
-    def is_ahead(self) -> bool:
-        """Whether it predicts 5 s ahead better than the null beyond chance."""
-        return self.against["horizon_rmse_m"].outcome is ErrorChange.BETTER
+    def horizon_change(self) -> ErrorChange:
+        """How it predicts 5 s ahead beside the null."""
+        return self.against["horizon_rmse_m"].outcome
 
     @property
     def is_better(self) -> bool:
@@ -65,7 +65,7 @@ class Law(NamedTuple):
         With more parameters of the drivers' own it must predict 5 s ahead better beyond chance: in closed loop these
         may only spread a driver's noise over more of them.
         """
-        return (self.is_ahead or not self.own) and lowers(self.against)
+        return (self.horizon_change is ErrorChange.BETTER or not self.own) and lowers(self.against)
 
     @property
     def mean_ratio(self) -> float:
@@ -92,7 +92,6 @@ def compared(
     """
     own, named = null.catalogue.base, tuple(null.named)
     laws = [Law(own, null, first, {})]
-    others = [base_named(name) for name in BASES if name != own.kind]
 
     def add(model: Hypothesis) -> None:
         law = model.catalogue.base
@@ -100,26 +99,25 @@ def compared(
         errors = judged(model)
         laws.append(Law(law, model, errors, compare(first, errors, seed)))
 
-    for law in others:
-        add(Hypothesis(null.terms, Catalogue(named, law, located=False)))
+    for name in (name for name in BASES if name != own.kind):
+        add(Hypothesis(null.terms, Catalogue(named, base_named(name), located=False)))
     # Whether a part of a law does the work, or all of it, is told beside it.
     for each in laws[1:]:
-        for name in each.law.spared if each.is_ahead or each.is_better else ():
+        for name in each.law.spared if each.horizon_change is ErrorChange.BETTER or each.is_better else ():
             add(Hypothesis(null.terms, replace(each.model.catalogue, without=(name,))))
-    better = best_of(laws)
-    # A better law comes first: what it lacks is sought, before anything is put down to its drivers.
+    # A better law comes first: what it lacks is sought, before anything is put down to its drivers. Else the best of
+    # those with the null's parameters is treated as the null is, if it is no worse, and all where that helps.
+    alike = [] if best_of(laws).against else [each for each in laws[1:] if each.law.declared == own.declared]
     add(personal(null, own))
-    if laws[-1].is_better and not better.against:
-        for law in others:
-            if law.declared == own.declared:
-                add(personal(null, law))
+    for i, each in enumerate(sorted(alike, key=lambda law: law.mean_ratio)):
+        if best_of(laws).against or (i == 0 and each.horizon_change is not ErrorChange.WORSE):
+            add(personal(null, each.law))
     return laws
 
 
 def personal(null: Hypothesis, law: CarFollowing) -> Hypothesis:
     """Return a law in the null's place, with all effects whose strengths may be each driver's own."""
-    named = {e.name for e in null.named}
-    effects = tuple(make(name) for name, cls in ALL.items() if cls.per_driver and name not in named)
+    effects = tuple(make(n) for n, cls in ALL.items() if cls.per_driver and n not in [e.name for e in null.named])
     own = Catalogue((*null.named, *effects), law, located=False, personal=tuple(e.name for e in effects))
     return Hypothesis((*null.terms, *(terms.personal(e) for e in effects)), own)
 

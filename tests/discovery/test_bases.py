@@ -149,20 +149,31 @@ def test_what_the_parts_of_a_law_do_is_told_beside_it_where_another_law_is_the_b
     assert [parts for parts in asked if parts] == ([("feed_forward",), ("lag",)] if ratio < 1.0 else [])
 
 
-@pytest.mark.parametrize("helps", [True, False])
-def test_own_strengths_are_tried_on_every_law_alike_where_they_help(
-    helps: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("better", "ratio", "tried"),
+    [
+        ([], 1.0, ["idm", "iidm"]),
+        ([], 1.1, ["idm"]),
+        ([("idm", True)], 1.1, ["idm", "iidm", "idm_plus"]),
+        ([("iidm", True)], 1.0, ["idm", "iidm", "idm_plus"]),
+        ([("gipps", False), ("idm", True)], 1.0, ["idm"]),
+    ],
+    ids=["no worse", "worse", "IDM's own help", "the best other's own help", "a law alone helps"],
+)
+def test_own_strengths_are_tried_on_the_best_law_alike_as_on_idm(
+    better: list[tuple[str, bool]], ratio: float, tried: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of laws with the same parameters; no screen by errors of the very data, which threw the right model away."""
-    null, asked = Hypothesis(), []
+    """``ratio``: the errors of the improved IDM to IDM's, cross-fitted: those of the very data misled."""
+    asked = []
+    ratios = dict.fromkeys(better, 0.5) | {("iidm", False): ratio}
 
     def judged(model: Hypothesis) -> Judged:
         asked.append((model.catalogue.base.kind, bool(model.catalogue.personal)))
-        return cast(Any, "errors")
+        return cast(Any, asked[-1])
 
-    monkeypatch.setattr(bases, "compare", lambda *_: error(1.2))
-    monkeypatch.setattr(bases.Law, "is_better", property(lambda law: helps and bool(law.own)))
-    bases.compared(null, cast(Any, "errors"), judged, 0, lambda *_: None)
-    own = [kind for kind, personal in asked if personal]
-    alike = [name for name in BASES if base_named(name).declared == null.catalogue.base.declared]
-    assert own == (alike if helps else ["idm"]) and len(alike) > 1
+    monkeypatch.setattr(bases, "compare", lambda _, law, __: error(ratios.get(law, 1.2)))
+    bases.compared(Hypothesis(), cast(Any, "idm"), judged, 0, lambda *_: None)
+    assert [kind for kind, personal in asked if personal] == tried
+    assert {name for name in BASES if base_named(name).declared == base_named("idm").declared} == {
+        "idm", "iidm", "idm_plus",
+    }  # fmt: skip
