@@ -1,8 +1,7 @@
 """What sort of drift it is: every sort estimated on the same records, against drivers who do not drift."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -33,9 +32,9 @@ APART = 5.0
 class Told:
     """Estimates by name of the drift, that without any, and ``one_of``: sorts that the data do not tell apart.
 
-    ``one_of`` is empty for drivers who do not drift; its first is the likeliest. Sorts that were not estimated
-    (``Estimate.why_not``) are compared with nothing. ``foresees``: whether any forecasts drivers kept back better than
-    none does, as far as that was tried.
+    ``one_of`` is empty for drivers who do not drift. Its first is the likeliest, or what forecasts drivers kept back
+    better beyond chance. Sorts that were not estimated (``Estimate.why_not``) are compared with nothing. ``foresees``:
+    whether none forecasts no better than it, beyond chance, as far as that was tried.
     """
 
     steady: Estimate
@@ -71,7 +70,6 @@ class _Sort:
     kinds: tuple[Effect, ...]
     smooth: Batch
     measured: Batch
-    noise: tuple[float, float] | None
 
     def __str__(self) -> str:
         return " and ".join(kind.name for kind in self.kinds) or "no drift"
@@ -82,30 +80,23 @@ class _Sort:
 
 
 def _estimated(sort: _Sort, progress: OnProgress) -> dict[str, Tensor]:
-    more: Any = {"measured": sort.measured, "noise": sort.noise}
-    return estimate(sort.simulator, sort.smooth, IDM_NAMES, usual(IDM_NAMES), **more).numbers()
+    return estimate(sort.simulator, sort.smooth, IDM_NAMES, usual(IDM_NAMES), measured=sort.measured).numbers()
 
 
 def tell(
-    smooth: Sequence[Episode],
-    measured: Sequence[Episode],
-    kinds: Sequence[Effect] = DRIFTS,
-    *,
-    noise: tuple[float, float] | None = None,
-    store: Store | None = None,
-    executor: Executor | None = None,
-    on_progress: OnProgress = silent,
-) -> Told:
+    smooth: Sequence[Episode], measured: Sequence[Episode], kinds: Sequence[Effect] = DRIFTS, *,
+    store: Store | None = None, executor: Executor | None = None, on_progress: OnProgress = silent,
+) -> Told:  # fmt: skip
     """Estimate every sort of drift on episodes, smoothed and as measured, and say which one it is.
 
     A wandering time gap and noise of the acceleration are tried together, too: two processes are told only where they
-    beat the best single one as that has to beat none.
+    beat the best single one as that has to beat none. The search of a sort that comes out less likely than with
+    fewer of its processes, or none, went astray: it is not estimated.
 
     Args:
         smooth: Drivers behind leaders, smoothed.
         measured: The same as measured.
         kinds: Drifting effects.
-        noise: Noise of measured gap (m) and speed (m/s), where it is known.
         store: Keeps every estimate, and has those that an interrupted run left.
         executor: Whoever estimates the sorts, a part each.
         on_progress: Called with the name, done, total and the log-likelihood.
@@ -113,17 +104,21 @@ def tell(
     batch, raw = (Batch.stack(x, substeps=1) for x in (smooth, measured))
     both = tuple(kind for name in PAIR for kind in kinds if kind.name == name)
     each = [(), *((kind,) for kind in kinds), *([both] if len(both) > 1 else [])]
-    sorts = [_Sort(processes, batch, raw, noise) for processes in each]
-    stored = {} if store is None else {s: x for s in sorts if (x := store.get(str(s))) is not None}
+    sorts = [_Sort(processes, batch, raw) for processes in each]
+    store = store or Store(None, "", resume=False)
+    stored = {s: x for s in sorts if (x := store.get(str(s))) is not None}
     missing = [s for s in sorts if s not in stored]
     for place, numbers in (executor or Serial()).map(_estimated, missing):
         stored[missing[place]] = numbers
-        if store is not None:
-            store.put(str(missing[place]), numbers)
+        store.put(str(missing[place]), numbers)
         on_progress(str(missing[place]), len(stored), len(sorts), float(numbers["log_likelihood"]))
     drivers = (MeasuredDrivers(s.simulator, batch, raw, IDM_NAMES) for s in sorts)
-    steady, *others = (Estimate.of_numbers(d, stored[s]) for d, s in zip(drivers, sorts, strict=True))
-    estimates = dict(zip(map(str, sorts[1:]), others, strict=True))
+    first = [Estimate.of_numbers(d, stored[s]) for d, s in zip(drivers, sorts, strict=True)]
+    steady, estimates = first[0], {}
+    for sort, candidate in zip(sorts[1:], first[1:], strict=True):
+        own = set(candidate.drivers.drifts)
+        cases = [e.log_likelihood for e in first if set(e.drivers.drifts) < own and not e.why_not]
+        estimates[str(sort)] = replace(candidate, nested=max(cases, default=candidate.nested))
     answer = Told(steady, estimates, ())
     order = sorted((n for n in estimates if not estimates[n].why_not), key=lambda name: -answer.gain[name])
     if answer.verdict == "cannot_tell":

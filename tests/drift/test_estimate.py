@@ -205,6 +205,14 @@ def test_what_is_not_finite_or_at_a_limit_is_not_estimated(monkeypatch: pytest.M
         alone = replace(told, found={"accel_noise": broken}, one_of=())
         assert alone.verdict == "cannot_tell" and why in sentence(alone)
     assert replace(one, steady=replace(steady, log_likelihood=math.nan)).verdict == "cannot_tell"
+    astray = replace(right, log_likelihood=steady.log_likelihood - 4000.0)
+    answers = iter((steady, astray, right))
+    monkeypatch.setattr(kinds, "estimate", lambda *_, **__: next(answers))
+    found = tell(smooth, raw, (PerceptionNoise(), Wander())).found
+    assert "went astray" in found["perception_noise"].why_not and "4000 higher" in found["perception_noise"].why_not
+    assert not found["wander"].why_not
+    still = replace(astray, settings=replace(right.settings, sigma=np.array([0.0015])), nested=steady.log_likelihood)
+    assert not still.why_not, "a drift of nothing is none"
     vague = replace(right, log_error=np.where([n.endswith("memory_time") for n in right.names], 20.0, right.log_error))
     told = sentence(replace(one, found={"wander": vague}, one_of=("wander",)))
     assert "s (these data do not tell it)" in told and " to " in told and "e+" not in told
