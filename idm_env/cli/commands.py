@@ -504,8 +504,8 @@ def drift(
 ) -> None:
     """Estimate how unsteady drivers are: which quantity wanders, by how much (sigma), with which memory time (tau).
 
-    Writes report.html, and model.yaml, the model that forecasts drivers kept back best, for simulate --model and as
-    `effects` of environments.
+    Writes report.html, and model.yaml for simulate --model and as `effects` of environments: the likeliest model,
+    unless another forecasts drivers kept back better beyond chance.
 
     Args:
         drivers: Drivers at most, evenly spread over the file.

@@ -3,8 +3,6 @@
 Shapes: levels are ``[T, rows, p + k]``, drawn futures ``[steps, draws, starts]``.
 """
 
-import math
-
 import numpy as np
 import torch
 
@@ -29,16 +27,10 @@ def followed(
 
 
 def draw_gaps(
-    drivers: MeasuredDrivers,
-    settings: DriftSettings,
-    theta: np.ndarray,
-    levels: tuple[np.ndarray, np.ndarray],
-    starts: list[tuple[int, int]],
-    seconds: float,
-    count: int,
-    seed: int = 0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``count`` drawn futures of gap and speed [steps, count, starts], each start a (row, sample).
+    drivers: MeasuredDrivers, settings: DriftSettings, theta: np.ndarray, levels: tuple[np.ndarray, np.ndarray],
+    starts: list[tuple[int, int]], seconds: float, count: int, seed: int = 0,
+) -> np.ndarray:  # fmt: skip
+    """Return ``count`` drawn futures of the gap [steps, count, starts], each start a (row, sample).
 
     They begin at the measured state, with a draw of what is known of the ``levels`` (of ``followed``) then. Beyond the
     end of a record a future means nothing.
@@ -46,14 +38,13 @@ def draw_gaps(
     steps = round(seconds / drivers.batch.dt)
     some = range(0, len(starts), 64)
     chunks = [_chunk(drivers, settings, theta, levels, starts[i : i + 64], steps, count, seed + i) for i in some]
-    gap, speed = (np.concatenate(x, -1) for x in zip(*chunks, strict=True))
-    return gap, speed
+    return np.concatenate(chunks, -1)
 
 
 def _chunk(
     drivers: MeasuredDrivers, settings: DriftSettings, theta: np.ndarray, levels: tuple[np.ndarray, np.ndarray],
     starts: list[tuple[int, int]], steps: int, count: int, seed: int,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> np.ndarray:  # fmt: skip
     simulator, d = drivers.simulator, drivers.driver
     batch = Batch.stack([drivers.batch.episodes[r].part(t, t + steps + 1) for r, t in starts], substeps=1)
     random = np.random.default_rng(seed)
@@ -68,10 +59,6 @@ def _chunk(
         one = torch.ones((), dtype=torch.float64)
         params[name] = {**params[name], "sigma": settings.sigma[j] * one, "memory_time": settings.memory_time[j] * one}
     state = batch.start(simulator, params)
-    for effect in simulator.effects:
-        if effect.draws and not effect.remembers:  # white: what the filter calls jitter
-            sigma = torch.tensor(settings.jitter / math.sqrt(simulator.dt), dtype=torch.float64)
-            params[effect.name] = {**params[effect.name], "sigma": sigma}
     memory = {
         name: torch.tensor(level[..., own + j] / settings.sigma[j]).unsqueeze(-1).expand(state.speed.shape).contiguous()
         for j, name in enumerate(drivers.drifts)
@@ -80,9 +67,8 @@ def _chunk(
     inputs = mapped(lambda x: x.unsqueeze(1), dict(batch.inputs(simulator.without(*simulator.draws))))
     inputs = simulator.drawn(state.speed, inputs, batch.steps, seed)
     _, trajectory = simulator.rollout(state, inputs, params, batch.steps)
-    parts = (x[..., d].numpy() for x in (trajectory.gap, trajectory.speed))
-    gap, speed = (np.pad(x, [(0, steps - len(x)), (0, 0), (0, 0)], constant_values=np.nan) for x in parts)
-    return gap, speed
+    gap = trajectory.gap[..., d].numpy()
+    return np.pad(gap, [(0, steps - len(gap)), (0, 0), (0, 0)], constant_values=np.nan)
 
 
 def crps(drawn: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -99,14 +85,11 @@ def crps(drawn: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.asarray(first - (weight * ranked).sum(0) / (n * (n - 1.0)))
 
 
-def covers(drawn: np.ndarray, truth: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether the central band of ``share`` of the draws holds the truth, and the band's width."""
-    low, high = np.quantile(drawn, [0.5 - 0.5 * share, 0.5 + 0.5 * share], axis=0)
-    return (truth >= low) & (truth <= high), high - low
+def half_widths(drawn: np.ndarray, truth: np.ndarray, share: float) -> np.ndarray:
+    """Return how far truths […] are from medians of draws [n, …], in half widths of their central bands of ``share``.
 
-
-def widening(drawn: np.ndarray, truth: np.ndarray, share: float) -> float:
-    """Return the factor by which central bands of draws [n, …] hold ``share`` of truths […], widened from medians."""
+    A band holds what is within 1; the quantile ``share`` is the factor that widens bands to hold as many truths.
+    """
     low, middle, high = np.quantile(drawn, [0.5 - 0.5 * share, 0.5, 0.5 + 0.5 * share], axis=0)
     half = np.where(truth < middle, middle - low, high - middle)
-    return float(np.quantile(np.abs(truth - middle) / np.maximum(half, 1e-9), share))
+    return np.asarray(np.abs(truth - middle) / np.maximum(half, 1e-9))

@@ -22,6 +22,8 @@ from idm_env.reports import page
 WRITTEN = ("model.yaml", "report.json", "report.html")
 UNKNOWN = 100.0
 """An interval that reaches so many times as far as its estimate is none."""
+UNSAID = ("forecasts", "crps_by_driver_m")
+"""What a report's scores have and its table leaves out."""
 DRIVERS = 60
 """Drivers at most on whom drift is estimated."""
 STEP_S = 0.5
@@ -36,18 +38,15 @@ def step_of(trajectories: Trajectories) -> float | None:
 
 
 def drift_file(
-    source: Source,
-    out: Path,
-    *,
-    drivers: int = DRIVERS,
-    resume: bool = False,
-    executor: Executor | None = None,
-    on_progress: OnProgress | None = None,
-) -> dict[str, Any]:
+    source: Source, out: Path, *, drivers: int = DRIVERS, resume: bool = False,
+    executor: Executor | None = None, on_progress: OnProgress | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Say how the drivers of a file drift, and return the report; write it, a page and ``model.yaml``.
 
     ``drivers`` are taken at most, evenly spread over the file; every fourth driver is kept back, and forecasts of those
-    are scored. ``executor`` estimates the sorts. ``resume`` goes on with the estimates of an interrupted run.
+    are scored. Headline and model are the likeliest sort, unless another forecasts better beyond chance
+    (``held_out.foremost``). σ is as estimated: bands are widened by the drivers kept back, and no factor of σ does so
+    at all horizons. ``executor`` estimates the sorts. ``resume`` goes on with the estimates of an interrupted run.
     DataError and ValueError for what cannot be read.
     """
     with storage.results(out, WRITTEN, (source.path,)):
@@ -64,9 +63,11 @@ def drift_file(
         progress("kept back", 0, 0, f"{len(rest)} drivers")
         sorts = {"no drift": answer.steady} | {name: e for name, e in answer.found.items() if not e.why_not}
         scores = held_out.scores(sorts, back[0], back[1]) if len(rest) and answer.verdict != "cannot_tell" else []
-        foremost, foreseen = held_out.sentence(scores, next(iter(answer.one_of), None), len(rest))
-        answer = replace(answer, foresees=foremost != "no drift")
-        best = sorts.get(foremost) or (answer.found[answer.one_of[0]] if answer.one_of else answer.steady)
+        likeliest = next(iter(answer.one_of), "no drift")
+        foremost = held_out.foremost(scores, likeliest)
+        one_of = tuple(n for n in dict.fromkeys((foremost, *answer.one_of)) if n != "no drift")
+        answer = replace(answer, one_of=one_of, foresees=foremost != "no drift" or foremost == likeliest)
+        best = sorts[foremost]
         marked = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in fitted[0]])
         save_model(out / "model.yaml", replace(model_of(best), fitted_on=marked))
         data: dict[str, Any] = {"episodes": len(both[0]), "taken": len(taken), "dt": best.drivers.batch.dt}
@@ -74,7 +75,7 @@ def drift_file(
         result = {
             "verdict": answer.verdict,
             "one_of": list(answer.one_of),
-            "sentence": f"{foreseen} {sentence(answer)}".lstrip(),
+            "sentence": f"{held_out.sentence(scores, likeliest)} {sentence(answer)}".lstrip(),
             "sorts": _sorts(answer),
             "kept_back": {"drivers": len(rest), "scores": scores},
             "estimates": {name: [] if e.why_not else e.table() for name, e in named.items()},
@@ -109,7 +110,7 @@ def sentence(answer: Told) -> str:
     """Return in one sentence how drivers drift."""
     if answer.verdict == "cannot_tell" and answer.foresees:
         why = answer.steady.why_not or "; ".join(f"{name}: {e.why_not}" for name, e in answer.found.items())
-        return f"These data cannot tell how drivers drift: {why}."
+        return f"These data cannot tell how drivers drift. Not estimated: {why}."
     if not answer.one_of:
         return "No drift: steady drivers and white noise explain these records as well."
     best, kinds = answer.found[answer.one_of[0]], {kind.name: kind for kind in DRIFTS}
@@ -117,25 +118,27 @@ def sentence(answer: Told) -> str:
     parts = []
     for name in best.drivers.drifts:
         size = next(p.unit for p in kinds[name].parameters if p.name == "sigma")
-        parts.append(f"{kinds[name].title} ({name})")
+        words = [f"{kinds[name].title} ({name})"]
         for key, symbol, unit in (("sigma", "sigma", "" if size == "1" else f" {size}"), ("memory_time", "tau", " s")):
             row = rows[f"{name}.{key}"]
             estimate, low, high = (float(row[end]) for end in ("estimate", "low", "high"))
             interval = f"{low:.3g} to {high:.3g}" if high < UNKNOWN * estimate else "these data do not tell it"
-            parts.append(f"{symbol} {estimate:.3g}{unit} ({interval})")
+            words.append(f"{symbol} {estimate:.3g}{unit} ({interval})")
+        parts.append(", ".join(words))
     apart = "".join(f" Not told apart from {kinds[n].title} ({n})." for n in answer.one_of[1:])
     unclear = "These data cannot tell how drivers drift. Likelier on those estimated, and worse in forecasts"
-    return f"{'Drivers drift' if answer.foresees else unclear}: {', '.join(parts)}.{apart}"
+    return f"{'Drivers drift' if answer.foresees else unclear}: {'. And '.join(parts)}.{apart}"
 
 
 def _sorts(answer: Told) -> list[dict[str, Any]]:
+    """Return a row for every sort: its gain, and σ and τ (s), a list where it has several processes."""
     rows: list[dict[str, Any]] = []
     for name in sorted(answer.found, key=lambda n: (bool(answer.found[n].why_not), -answer.gain[n])):
-        why = answer.found[name].why_not or answer.steady.why_not
-        numbers = {} if why else {str(row["name"]): row["estimate"] for row in answer.found[name].table()}
-        row = {"sort": name, "log_likelihood": None if why else answer.gain[name]}
-        row |= {"sigma": numbers.get(f"{name}.sigma"), "tau_s": numbers.get(f"{name}.memory_time")}
-        rows.append(row | {"note": f"not estimated: {why}" if why else ""})
+        why, s = answer.found[name].why_not or answer.steady.why_not, answer.found[name].settings
+        sigma, tau = (x.tolist() if len(x) > 1 else float(x[0]) for x in (s.sigma, s.memory_time))
+        row = {"log_likelihood": answer.gain[name], "sigma": sigma, "tau_s": tau}
+        row = dict.fromkeys(row) if why else row
+        rows.append({"sort": name, **row, "note": f"not estimated: {why}" if why else ""})
     return rows
 
 
@@ -143,6 +146,7 @@ def tables(report: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """Return the rows of a report under their names in words and units, by the title of their table."""
     names = {"ahead_s": "ahead (s)", "gap_rmse_m": "RMSE (m)", "gap_crps_m": "CRPS (m)", "tau_s": "tau (s)"}
     names |= {"in_90_percent": "in the 90 % band (%)", "widening": "widening to hold 90 %"}
+    names |= {"widened_90_percent": "in it as others widen it (%)"}
     names |= {"sort": "variant", "log_likelihood": "gain in log-likelihood"}
     both = {
         f"Forecasts of the gap of {report['kept_back']['drivers']} drivers kept back": report["kept_back"]["scores"],
@@ -150,6 +154,7 @@ def tables(report: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
     }
 
     def row_in_words(row: dict[str, Any]) -> dict[str, Any]:
-        return {names.get(k, k): row[k] for k in row if k not in ("forecasts", "in_50_percent")}
+        texts = {k: ", ".join(map(page.number, x)) if isinstance(x, list) else x for k, x in row.items()}
+        return {names.get(k, k): x for k, x in texts.items() if k not in UNSAID}
 
     return {title: [row_in_words(row) for row in rows] for title, rows in both.items() if rows}
