@@ -57,7 +57,7 @@ right.bar(range(6), gradient), right.set(xlabel="vehicle", ylabel="metres per se
 """,
     "find_a_hidden_effect": """
 _, (left, right) = plt.subplots(1, 2, figsize=(7, 2.8), layout="constrained")
-left.bar(["IDM", "IDM with delay"], [before, after]), left.set(ylabel="RMSE of the gap, test set (m)")
+left.bar(["IDM", "IDM with delay"], [before, after]), left.set(ylabel="RMSE of the gap, held out (m)")
 right.errorbar([delay["estimate"]], [0], xerr=[[delay["estimate"] - delay["low"]], [delay["high"] - delay["estimate"]]],
                fmt="o", capsize=4, label="estimate, 95 % interval")
 right.axvline(truth.effects["delay"], color="black", lw=0.8, label="truth")

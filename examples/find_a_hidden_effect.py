@@ -14,5 +14,5 @@ print(f"verdict: {report['verdict']}, effect: {best['effect']}")
 print(
     f"delay {delay['estimate']:.3f} s ({delay['low']:.3f} to {delay['high']:.3f}), truth {truth.effects['delay']:.3f} s"
 )
-print(f"gap RMSE on the test set: {before:.2f} m before, {after:.2f} m after")
+print(f"gap RMSE on held-out runs: {before:.2f} m before, {after:.2f} m after")
 assert best["effect"] == "delay" and after < before

@@ -239,7 +239,7 @@ def test_the_demo_finds_what_its_generator_hid(tmp_path: Path) -> None:
     verdict = next(line for line in done.stderr.splitlines() if line.startswith("Verdict"))
     for shown in ("README.md", "docs/index.md"):  # what they show is this run, but for rounding on other machines
         text = " ".join((Path(__file__).parents[1] / shown).read_text(encoding="utf-8").split())
-        printed = re.search(r"Verdict: named.*?\]\)\.", text)
+        printed = re.search(r"Verdict: named.*?\]\.", text)
         assert printed is not None and same_numbers(printed[0], verdict)
         falls = re.search(r"falls from [\d.]+ to [\d.]+ m", text)
         assert shown != "README.md" or (falls and same_numbers(falls[0], f"falls from {before} to {after} m"))

@@ -53,7 +53,7 @@ def undecided(result: dict[str, Any], out: Path) -> None:
 
 
 def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
-    """Print the findings of ``explain`` and the errors on the test set before and after."""
+    """Print the findings of ``explain`` and the errors on held-out runs before and after."""
     if not result["models"]:
         undecided(result, out)
         return
@@ -66,7 +66,7 @@ def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> Non
     console.print(result["sentence"], soft_wrap=True, highlight=False)
     before = result["error"]["before"]
     if before is not None:
-        show("Errors on the test set", error_rows(result, models))
+        show("Errors on held-out runs", error_rows(result, models))
     for name, state, text in rolled({file: Rolled(**figures) for file, figures in result["rolled"].items()}):
         console.print(f"{name}: {text}", style="bold red" if state else "", highlight=False)
     if before is not None:

@@ -1,4 +1,4 @@
-"""Is an error on the test set better, the same or worse, and how sure is that: bootstrap over followers or runs."""
+"""Is an error on held-out runs better, the same or worse, and how sure is that: bootstrap over followers or runs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""From what a search decided to a discovery: judged on the test set, beside other laws, told, and saved as models."""
+"""From what a search decided to a discovery: judged on held-out runs, beside other laws, told, and saved as models."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -22,12 +22,12 @@ from idm_env.discovery.verdict import Reason, Refusal, improves
 from idm_env.reports.undecided import GROUPS
 
 Calibration = tuple[Solution, judge.Judged | None]
-"""Parameters of all drivers, and errors on the test set where there is one."""
+"""Parameters of all drivers, and errors on held-out runs where there are any."""
 
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """Two models on the test set: IDM, and IDM with what was added, or with what came nearest to that.
+    """Two models on held-out runs: IDM, and IDM with what was added, or with what came nearest to that.
 
     ``refusal`` says why nothing (more) was added; ``compared`` is None where nothing came near.
     """
@@ -58,7 +58,7 @@ class Judgement:
 
     @cached_property
     def errors(self) -> dict[str, Comparison]:
-        """How the errors on the test set changed; empty where nothing can be compared."""
+        """How the errors on held-out runs changed; empty where nothing can be compared."""
         if self.compared is None or self.before is None or self.after is None:
             return {}
         return compare(self.before, self.after, self.seed)
@@ -234,7 +234,7 @@ class Evaluation:
 
 
 def judgement_of(evaluation: Evaluation, decided: Decided) -> tuple[Judgement, Solution]:
-    """Evaluate the selected model on the test set; return the judgement and the drivers' parameters fitted with it."""
+    """Evaluate the selected model on held-out runs; return the judgement and the drivers' parameters fitted with it."""
     null, rounds = decided.null, decided.rounds
     confirmed, refusal = _confirmed(evaluation, decided)
     # Where nothing was added, what came nearest is compared with the null and says what it would have done.

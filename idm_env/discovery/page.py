@@ -107,6 +107,6 @@ def cards(r: Result, law: str) -> list[tuple[str, str, str]]:
         facts.append(("How much", f"{number(spot.accel_mps2, 2)} m/s² beside {law}"))
     if (before := r.error.before) is not None:
         gap, noise = number(before["gap_rmse_m"]), number(r.error.floor["gap_rmse_m"])
-        size = f"{gap} m on the test set; sensor noise alone leaves {noise} m"
+        size = f"{gap} m on held-out runs; sensor noise alone leaves {noise} m"
         facts.append((f"Gap in free simulation, {law}", size))
     return [(name, "", text) for name, text in facts]

@@ -75,7 +75,7 @@ class GivenParameter:
 
 @dataclass(frozen=True)
 class Change:
-    """How an error changed on the test set, pooled and as the mean of drivers' own ratios, with 95 % intervals.
+    """How an error changed on held-out runs, pooled and as the mean of drivers' own ratios, with 95 % intervals.
 
     ``interval`` is the one that the verdict goes by, in words.
     """
@@ -107,7 +107,7 @@ class DriverError:
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """Errors on the test set; ``floor`` is what sensors alone would leave."""
+    """Errors on held-out runs; ``floor`` is what sensors alone would leave."""
 
     held_out_runs: list[str]
     held_out_drivers: list[DriverError]

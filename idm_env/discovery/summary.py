@@ -1,4 +1,4 @@
-"""Makes the result of a discovery: what was found, what it does for errors on the test set, and all that was tried."""
+"""Makes the result of a discovery: what was found, what it does for errors on held-out runs, and all that was tried."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def summarise(
         trajectories: The data.
         evaluation: How models were calibrated and judged.
         decided: What the search says.
-        judged: What the test set says of that.
+        judged: Models compared on held-out runs.
         laws: All laws alone, that of the null first.
         drivers: Their parameters by the null, by the model beside it, and by a law that is better.
         floor: Errors that sensors alone would leave.

@@ -15,6 +15,7 @@ from idm_env.discovery.model import Term
 from idm_env.discovery.result import Ceilings, TermFinding, Weight
 from idm_env.discovery.rolled import FOLLOWERS, Rolled
 from idm_env.discovery.score import Contrast
+from idm_env.discovery.selection import NAMED_GAIN
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution
 from idm_env.discovery.tails import WORST
@@ -68,6 +69,11 @@ def amount(x: float, unit: str) -> str:
     return number(x) if unit == "1" else f"{number(x)} {unit}"
 
 
+def capital(text: str) -> str:
+    """Return a text that begins with a capital."""
+    return text[:1].upper() + text[1:]
+
+
 def plain(name: str) -> str:
     """Return a candidate's plain name, or the label of what is only located, without underscores."""
     return (name in ALL and ALL[name].title) or name.replace("_", " ")
@@ -85,35 +91,34 @@ def told(p: Parameter, estimate: float, low: float, high: float) -> str:
 
 
 def clause(term: Term, values: Sequence[Sequence[float]], contrast: Contrast | None = None, law: str = "IDM") -> str:
-    """Return what drivers do with a term in the model, its equation and its parameters [(estimate, low, high)].
+    """Return what drivers do with a term in the model, then its equation and parameters [(estimate, low, high)].
 
-    Of a curve without a name its ``contrast`` is told. ``law`` is the title of what the term was added to.
+    These are two sentences, the first without its capital and the second without its end. Of a curve without a name its
+    ``contrast`` is told. ``law`` is the title of what the term was added to.
     """
-    estimates = [v[0] for v in values]
+    estimates, strength = [v[0] for v in values], term.parameters[0]
     if len(values) <= MANY:
         shown = [p.role != "place" or term.effect is not None for p in term.parameters]
         numbers = ", ".join(told(p, *v) for p, v, show in zip(term.parameters, values, shown, strict=True) if show)
     else:
-        numbers = f"a curve of {len(values)} knots from {number(min(estimates))} to {number(max(estimates))}"
-        numbers += "" if term.parameters[0].unit == "1" else f" {term.parameters[0].unit}"
+        highest = amount(max(estimates), strength.unit)
+        numbers = f"a curve of {len(values)} knots from {number(min(estimates))} to {highest}"
     if term.effect is not None:
         effect = ALL[term.effect]
-        null = term.parameters[0].null or 0.0
-        below, above = effect.wording
-        text = (below if len(values) <= MANY and estimates[0] < null else above) or below
-        name = plain(term.effect)
-        told_as = f"{name}: {effect.equation}" if effect.equation else name
-        text = text.replace("{law}", law) or f"an effect is missing that {name} describes"
-        return f"{text} ({told_as}, with {numbers})"
-    below, above, noun, equation = CHANGES[term.what]
-    if contrast is not None:
-        return f"the {noun} {_contrast(term, estimates, contrast)} ({equation}, with {numbers})"
-    if len(values) > MANY or term.knots[2] > 2:
-        return f"the {noun} depends on the {noun_of(term)} ({equation}, with {numbers})"
-    if len(values) == 2:
-        return f"the {noun} drifts over {ALONG[term.coordinate]} ({equation}, with {numbers})"
-    text = below if estimates[0] < 0 else above
-    return f"{text} {_interval(term, estimates)} than elsewhere ({equation}, with {numbers})"
+        (below, above), noun, equation = effect.wording, plain(term.effect), effect.equation
+        text = (below if len(values) <= MANY and estimates[0] < (strength.null or 0.0) else above) or below
+        text = text.replace("{law}", law) or f"an effect is missing that {noun} describes"
+    else:
+        below, above, noun, equation = CHANGES[term.what]
+        if contrast is not None:
+            text = f"the {noun} {_contrast(term, estimates, contrast)}"
+        elif len(values) > MANY or term.knots[2] > 2:
+            text = f"the {noun} depends on the {noun_of(term)}"
+        elif len(values) == 2:
+            text = f"the {noun} drifts over {ALONG[term.coordinate]}"
+        else:
+            text = f"{below if estimates[0] < 0 else above} {_interval(term, estimates)} than elsewhere"
+    return f"{text}. {capital(f'{noun}: {equation}' if equation else noun)}, with {numbers}"
 
 
 def _contrast(term: Term, estimates: Sequence[float], c: Contrast) -> str:
@@ -131,7 +136,7 @@ def _contrast(term: Term, estimates: Sequence[float], c: Contrast) -> str:
         where += f" of a cycle of {term.period:.0f} s"
     prefix = f"a {ALONG[term.coordinate]} of " if term.fades else ""
     if term.by:
-        where += f", for each {amount(PER[term.by], FEATURES[term.by])} of {ALONG[term.by]}"
+        where += f", per {amount(PER[term.by], FEATURES[term.by])} of {ALONG[term.by]}"
     return f"is {difference} at {prefix}{where}".replace("[-", "[−")
 
 
@@ -156,13 +161,13 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
         Reason.FEW_RUNS: f"only {figure:.0f} run{' is' if figure == 1 else 's are'} left for model selection",
         Reason.NO_POWER: f"the {figure:.0f} runs left for model selection would not have shown most effects at their "
         "usual strengths",
-        Reason.NO_GAIN: "no candidate gains enough on held-out runs",
+        Reason.NO_GAIN: f"no candidate gains {NAMED_GAIN:.0%} on held-out runs beyond noise",
         Reason.SMALL_SIZE: f"{tried or 'what candidates gain'} moves predictions 5 s ahead by less than "
         f"{number(figure, 2)} m or half a step",
         Reason.SMALL_SHARE: f"{tried} explains only {figure:.0%} of what can be explained",
         Reason.CLOSED_LOOP: f"{tried} makes free simulation worse",
         Reason.TEST_SET: f"the test set does not confirm {tried}",
-        Reason.HELD_OUT: f"predictions of the test set get no better with {tried}",
+        Reason.HELD_OUT: f"predictions of held-out runs get no better with {tried}",
         Reason.STRUCTURE: (
             f"a smooth function of the scene takes {refusal.figure:.0%} off the squared error 5 s ahead, "
             "and no candidate does"
@@ -175,14 +180,14 @@ def headline(
     verdict: Verdict, clauses: Sequence[str], refusal: Refusal | None, tried: str, errors: Mapping[str, Comparison],
     shared: Shared | None = None, others: Sequence[str] = (), law: str = "IDM",
 ) -> str:  # fmt: skip
-    """Say in one sentence what is missing, or why nothing can be said.
+    """Return the sentences of a verdict, of which the first has neither equation nor estimates.
 
     Args:
         verdict: What is concluded.
         clauses: Of every term that was added.
         refusal: Why nothing was added.
         tried: Plain names of what came nearest, "" for nothing.
-        errors: How errors on the test set changed with what was added or came nearest.
+        errors: How errors on held-out runs changed with what was added or came nearest.
         shared: What vehicles of one run do alike, told where nothing was added.
         others: Effects that these data do not tell from what was added.
         law: Title of the law that was to be completed.
@@ -193,7 +198,7 @@ def headline(
     if shared is not None and not clauses:
         return common(shared)
     if verdict in (Verdict.NAMED, Verdict.ONE_OF, Verdict.SHAPE, Verdict.LOCATED):
-        parts = [f"{text[0].upper()}{text[1:]}." for text in clauses]
+        parts = [f"{capital(text)}." for text in clauses]
         if verdict is Verdict.ONE_OF:
             parts.append(f"These data do not tell it from {' or '.join(plain(x) for x in others)}.")
         elif verdict is not Verdict.NAMED:
@@ -202,16 +207,14 @@ def headline(
     if verdict is Verdict.NONE and refusal is not None and refusal.reason is Reason.SMALL_SIZE:
         return f"Nothing of practical size is missing: {reason(refusal, tried)}."
     if verdict is Verdict.NONE:
-        return "Nothing is missing that these data could show: no candidate lowers the held-out error."
+        return f"Nothing is missing that these data could show: {reason(Refusal(Reason.NO_GAIN))}."
     if verdict is Verdict.CANNOT_TELL:
         powerless = refusal is not None and refusal.reason is Reason.NO_POWER
         needed = "More runs, ten or more," if powerless else "Four runs of three followers or seven runs, better ten,"
         return f"These data cannot tell: {reason(refusal, tried)}. {needed} are needed (a quarter is the test set)."
     if refusal is not None and refusal.reason is Reason.HELD_OUT:
-        return (
-            f"Something is missing, but no candidate predicts better: {tried} was selected, and "
-            f"{_rises(errors)} on the test set."
-        )
+        against = f"{capital(tried)} was selected, and {_rises(errors)} on held-out runs."
+        return f"Something is missing, but no candidate predicts better. {against}"
     return f"Something is missing that no candidate explains: {reason(refusal, tried)}."
 
 
@@ -228,7 +231,7 @@ def beside_noise(verdict: Verdict, law: str, left_m: float, floor_m: float, ladd
         few = f"Half of its square lies with {len(ladder.few)} of the drivers ({who}), where noise of all would not"
         return f"{error}. {few}. An effect of a form that was not tried, which few meet, would explain it."
     if verdict is Verdict.UNDECIDED:
-        return f"{error}. U{drivers[1:]} would explain it, and so would an effect of a form that was not tried."
+        return f"{error}. {capital(drivers)} would explain it, and so would an effect of a form that was not tried."
     return f"{error}. No candidate explains it. {' '.join(tails(ladder))}"
 
 
@@ -254,7 +257,7 @@ def common(shared: Shared) -> str:
 
 
 def _rises(errors: Mapping[str, Comparison]) -> str:
-    """Say what the errors on the test set have against an addition."""
+    """Say what the errors on held-out runs have against an addition."""
     worse = [ERRORS[k][0] for k, c in errors.items() if c.outcome is ErrorChange.WORSE]
     if not any(c.ratio < 1.0 for c in errors.values()):
         return "no error falls"
@@ -270,12 +273,12 @@ def _rises(errors: Mapping[str, Comparison]) -> str:
 
 
 def _but(errors: Mapping[str, Comparison]) -> list[str]:
-    """Say what the errors on the test set take from a finding."""
+    """Say what the errors on held-out runs take from a finding."""
     worse = [ERRORS[k][0] for k, c in errors.items() if c.outcome is ErrorChange.WORSE]
     if worse:
-        return [f"On the test set the error of the {' and the '.join(worse)} is larger with it."]
+        return [f"On held-out runs the error of the {' and the '.join(worse)} is larger with it."]
     if errors and not any(c.outcome is ErrorChange.BETTER for c in errors.values()):
-        return ["No error on the test set is significantly lower with it."]
+        return ["No error on held-out runs is significantly lower with it."]
     gap = errors.get("gap_rmse_m")
     if gap is not None and gap.driver[0] > 1.0 + LEAST:
         return [f"The mean driver's error of the gap in free simulation changes by {percent(gap.driver[0])}."]
@@ -290,7 +293,7 @@ def details(found: Sequence[TermFinding], nearest: Sequence[TermFinding]) -> lis
     parts = []
     for f in found:
         parts.append(
-            f"{f.title[0].upper()}{f.title[1:]}: p = {number(f.p_value, 2)} over the whole list of candidates; first "
+            f"{capital(f.title)}: p = {number(f.p_value, 2)} over the whole list of candidates; first "
             f"of it in {f.chosen_in_folds:.0%} of choices without a fold of the runs."
         )
         if f.equivalent:
@@ -303,7 +306,7 @@ def details(found: Sequence[TermFinding], nearest: Sequence[TermFinding]) -> lis
         if f.told_by:
             parts.append(f"What would tell: {f.told_by}.")
     if nearest:
-        parts.append(f"Nearest came, without being added: {', and '.join(f.clause for f in nearest)}.")
+        parts += [f"{'With' if i else 'Nearest came, without being added'}: {f.clause}." for i, f in enumerate(nearest)]
     return parts
 
 
@@ -358,7 +361,7 @@ def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
     """
     better = change_of(law.against)
     if not (law.own and drivers is not None):
-        return f"{law.title[:1].upper()}{law.title[1:]} predicts better than {null} calibrated alike: {better}."
+        return f"{capital(law.title)} predicts better than {null} calibrated alike. Against {null}, {better}."
     share, finding = max(_of_drivers(drivers, null))
     first = finding if share >= MOST else "Drivers differ from each other in what IDM has in common for all."
     return f"{first} With strengths of each driver's own, {better}."
@@ -381,8 +384,8 @@ def _of_drivers(drivers: Solution, law: str) -> list[tuple[float, str]]:
             low, middle, high = np.quantile(theta[:, i], [0.1, 0.5, 0.9])
             share = float(np.mean(theta[:, i] > null if middle > null else theta[:, i] < null))
             text = ALL[name].wording[int(middle > null)].replace("{law}", law) or plain(name)
-            values = f"{p.symbol} = {number(middle, 2)}, of 80 % of drivers {number(low, 2)} to {number(high, 2)}"
-            strengths.append((share, f"{text[0].upper()}{text[1:]} ({values}; {law}: {number(null)})."))
+            values = f"{p.symbol} = {number(middle, 2)}, 80 % of drivers {number(low, 2)} to {number(high, 2)}"
+            strengths.append((share, f"{capital(text)}. The median driver has {values}, and {law} {number(null)}."))
     return strengths
 
 
@@ -397,7 +400,7 @@ def weight(prior: Weight) -> str:
 def rolled(of: Mapping[str, Rolled]) -> list[tuple[str, str, str]]:
     """Return waves and collisions of some models: a title, "worse" where the first alone crashes, figures.
 
-    The second, where there is one, is IDM.
+    A platoon is "worse", too, where waves grow along it with the first alone. The second, where there is one, is IDM.
     """
     if not of:
         return []
@@ -411,9 +414,10 @@ def rolled(of: Mapping[str, Rolled]) -> list[tuple[str, str, str]]:
         for x in of.values()
     ]
     platoons = [f"{grows}, {crash}" for grows, crash in zip(growth, crashes, strict=True)]
-    worse = ("worse" if bad else "" for bad in (first.crashed > idm.crashed, idm.ring_s is None is not first.ring_s))
+    waves = first.amplification > 1.0 > idm.amplification
+    bad = waves or first.crashed > idm.crashed, idm.ring_s is None is not first.ring_s
     titles = f"{FOLLOWERS} followers of one that brakes", f"Ring of {FOLLOWERS} drivers"
-    return list(zip(titles, worse, map("; IDM: ".join, (platoons, rings)), strict=True))
+    return list(zip(titles, ("worse" if x else "" for x in bad), map("; IDM: ".join, (platoons, rings)), strict=True))
 
 
 def ceilings(of: Ceilings, before_m: float | None, floor_m: float | None = None) -> str:
@@ -422,13 +426,13 @@ def ceilings(of: Ceilings, before_m: float | None, floor_m: float | None = None)
     if (share := of.repeats_share) is not None:
         parts.append(f"{100 * share:.0f} % of the gap's squared error repeats in matched situations of other runs")
     if (refit := of.refitted_gap_rmse_m) is not None and before_m is not None:
-        parts.append(f"parameters fitted to the test set itself leave {number(refit)} m of {number(before_m)} m")
+        parts.append(f"drivers fitted to the test set itself leave {number(refit)} m ({number(before_m)} m held out)")
     if (smooth := of.smooth_function_gain) is not None:
         parts.append(f"the best smooth function of the state lowers the error 5 s ahead by {100 * smooth:.1f} %")
     if floor_m is not None:
         parts.append(f"sensor noise alone leaves {number(floor_m, 2)} m")
     text = "; ".join(parts)
-    return f"{text[:1].upper()}{text[1:]}." if text else ""
+    return f"{capital(text)}." if text else ""
 
 
 def error_rows(report: Mapping[str, Any], titles: Sequence[str]) -> list[dict[str, Any]]:

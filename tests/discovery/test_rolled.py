@@ -36,6 +36,12 @@ def test_late_drivers_run_into_their_leaders_on_the_ring_and_behind_one_that_bra
     assert [state for _, state, _ in words.rolled({"model.yaml": late})] == ["", ""]
 
 
+@pytest.mark.parametrize(("model", "idm", "state"), [(1.2, 0.8, "worse"), (1.9, 1.2, ""), (0.9, 0.5, "")])
+def test_waves_that_grow_where_idms_fade_are_worse(model: float, idm: float, state: str) -> None:
+    rolls = {"model.yaml": Rolled(model, 0, None, 0.1), "model_idm.yaml": Rolled(idm, 0, None, 0.1)}
+    assert [said for _, said, _ in words.rolled(rolls)] == [state, ""]
+
+
 def test_drivers_of_the_model_take_turns_and_measured_inputs_are_refused() -> None:
     one, two = {"idm": {"time_gap": 0.8}}, {"idm": {"time_gap": 2.5}}
     model = drivers()
