@@ -245,7 +245,7 @@ def hats(values: np.ndarray, first: float, distance: float, count: int, period: 
 
 def best_period(responses: Responses, shortest: float = 6.0, longest: float = 150.0) -> tuple[str, float, np.ndarray]:
     """Return quantity and period (s) of the sine over the clock that explains most, and honest gains [units]."""
-    tries = list(product(PULSED, np.geomspace(shortest, longest, 60)))
+    tries = list(product(PULSED, np.geomspace(shortest, longest, 60).tolist()))
     designs = []
     for what, period in tries:
         phase = 2 * np.pi * responses.coordinates["time"] / period

@@ -223,6 +223,17 @@ def test_a_model_has_one_curve_over_the_past(platoon: Records) -> None:
         Hypothesis((since, mean))
 
 
+def test_a_model_with_the_period_that_explains_most_is_read_back(platoon: Records, tmp_path: Path) -> None:
+    """A report was not written for it: YAML has no numbers of numpy's."""
+    searching, null = begun(platoon, "drag")
+    what, cycle, _ = places.best_period(places.respond(searching.problem, null))
+    phase = terms.curve(what, "time", 0.0, cycle / 8, 8, cycle)
+    added, numbers = terms.effects_of(Hypothesis((phase,)), np.full(8, 0.1))
+    save_model(tmp_path / "model.yaml", Model((IDM(), *added, Brakes()), numbers))
+    back = load_model(tmp_path / "model.yaml")
+    assert back.effects == (IDM(), *added, Brakes()) and f"period: {cycle}" in (tmp_path / "model.yaml").read_text()
+
+
 @pytest.mark.parametrize("dt", [0.04, 0.1, 0.2, 0.3])
 def test_responses_of_all_seconds_are_that_of_the_whole_window(dt: float) -> None:
     """At every time step: a change that lasts is what its parts of a second add up to."""
