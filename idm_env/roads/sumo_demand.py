@@ -93,12 +93,12 @@ class _Reader:
             weight, many = number(element, "probability", 1.0, 0.0), self.variants if kind == "route" else 1
             pairs = [(weight, make(element, owner or name(element))) for _ in range(many)]
         else:
-            keys, pairs = element.get(f"{kind}s", "").split(), []
+            keys, pairs = element.get(f"{kind}s", "").split(), list[tuple[float, Any]]()
             weights = element.get("probabilities", "1 " * len(keys)).split()
             if len(keys) != len(weights):
                 raise ValueError(f"{name(element)}: {len(weights)} probabilities for {len(keys)} names. Give one each.")
-            for key, weight in zip(keys, weights, strict=True):
-                own = Element(element.tag, element.attrib | {"probabilities": weight})
+            for key, word in zip(keys, weights, strict=True):
+                own = Element(element.tag, element.attrib | {"probabilities": word})
                 pairs.append((number(own, "probabilities", None, 0.0), self._named(kind, key, element)[0][1]))
             pairs += [pair for each in element.iter(kind) for pair in self._choices(each, kind, owner)]
         if not sum(weight for weight, _ in pairs) > 0.0:
