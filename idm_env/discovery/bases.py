@@ -99,8 +99,9 @@ def compared(
         errors = judged(model)
         laws.append(Law(law, model, errors, compare(first, errors, seed)))
 
-    for name in (name for name in BASES if name != own.kind):
-        add(Hypothesis(null.terms, Catalogue(named, base_named(name), located=False)))
+    for name in BASES:
+        if name != own.kind:
+            add(Hypothesis(null.terms, Catalogue(named, base_named(name), located=False)))
     # Whether a part of a law does the work, or all of it, is told beside it.
     for each in laws[1:]:
         for name in each.law.spared if each.horizon_change is ErrorChange.BETTER or each.is_better else ():
@@ -117,7 +118,8 @@ def compared(
 
 def personal(null: Hypothesis, law: CarFollowing) -> Hypothesis:
     """Return a law in the null's place, with all effects whose strengths may be each driver's own."""
-    effects = tuple(make(n) for n, cls in ALL.items() if cls.per_driver and n not in [e.name for e in null.named])
+    named = {e.name for e in null.named}
+    effects = tuple(make(name) for name, cls in ALL.items() if cls.per_driver and name not in named)
     own = Catalogue((*null.named, *effects), law, located=False, personal=tuple(e.name for e in effects))
     return Hypothesis((*null.terms, *(terms.personal(e) for e in effects)), own)
 

@@ -247,10 +247,10 @@ class Network(Road):
 
     def ever_open(self, move: int) -> bool:
         """Return whether a move may be made at some time."""
-        s = int(self.signal[move])
-        phases = zip(self.plans[s].states, self.plans[s].durations, strict=True) if s >= 0 else ()
-        letters = (state[self.index[move]] for state, lasts in phases if lasts > 0.0)
-        return s < 0 or any(LETTERS[letter] in (GREEN, YIELD) for letter in letters)
+        if (s := int(self.signal[move])) < 0:
+            return True
+        phases = zip(self.plans[s].states, self.plans[s].durations, strict=True)
+        return any(LETTERS[state[self.index[move]]] in (GREEN, YIELD) for state, lasts in phases if lasts > 0.0)
 
     @cached_property
     def circles(self) -> list[list[int]]:

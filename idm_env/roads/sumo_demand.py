@@ -21,7 +21,7 @@ import numpy as np
 from idm_env import validation
 from idm_env.roads import sumo_files
 from idm_env.roads.network import Network, padded
-from idm_env.roads.sumo_files import name, number, seconds, text
+from idm_env.roads.sumo_files import name, number, parsed, seconds, text
 from idm_env.roads.ways import Route, Ways, arrivals, keyed
 
 PARAMETERS = {"accel": "max_accel", "decel": "comfort_decel", "tau": "time_gap", "minGap": "min_gap"}
@@ -46,6 +46,8 @@ READ["vehicle"] = {"id", "type", "depart", "departSpeed", "route", "color"}
 READ["trip"] = READ["vehicle"] | {"from", "to", "via"}
 READ["flow"] = READ["trip"] | {"begin", "end", "number", "vehsPerHour", "perHour", "period", "probability"}
 """Attributes that are read, or that change nothing; all others are counted."""
+ROUTES = {"route", "routeDistribution"}
+"""Elements that are read inside of others."""
 AS_IT_IS = {("departPos", "0"), ("departPos", "base"), ("delta", "4"), ("delta", "4.0")}
 """What is so without being said."""
 
@@ -93,14 +95,13 @@ class _Reader:
             weight, many = number(element, "probability", 1.0, 0.0), self.variants if kind == "route" else 1
             pairs = [(weight, make(element, owner or name(element))) for _ in range(many)]
         else:
-            keys, pairs = element.get(f"{kind}s", "").split(), list[tuple[float, Any]]()
+            keys = element.get(f"{kind}s", "").split()
             weights = element.get("probabilities", "1 " * len(keys)).split()
             if len(keys) != len(weights):
                 raise ValueError(f"{name(element)}: {len(weights)} probabilities for {len(keys)} names. Give one each.")
-            for key, word in zip(keys, weights, strict=True):
-                own = Element(element.tag, element.attrib | {"probabilities": word})
-                pairs.append((number(own, "probabilities", None, 0.0), self._named(kind, key, element)[0][1]))
-            pairs += [pair for each in element.iter(kind) for pair in self._choices(each, kind, owner)]
+            each = (parsed(word, element, "probabilities", 0.0) for word in weights)
+            pairs = [(weight, self._named(kind, key, element)[0][1]) for key, weight in zip(keys, each, strict=True)]
+            pairs += [pair for one in element.iter(kind) for pair in self._choices(one, kind, owner)]
         if not sum(weight for weight, _ in pairs) > 0.0:
             raise ValueError(f"{name(element)} has nothing of a probability above 0. Give it some.")
         if "id" in element.attrib:
@@ -135,8 +136,8 @@ class _Reader:
     def _count_unread(self, element: Element) -> None:
         for key in {*dict(element.attrib.items() - AS_IT_IS)} - READ[element.tag]:
             self.skipped[f"attribute {key} of {element.tag}"] += 1
-        for child in element if element.tag == "vType" else ():
-            self.skipped[f"elements <{child.tag}> of vType"] += 1
+        for child in element:
+            self.skipped[f"elements <{child.tag}> of {element.tag}"] += child.tag not in ROUTES
 
     # -- vehicles ----------------------------------------------------------------------------------------------------
 
@@ -174,10 +175,7 @@ class _Reader:
 
     def _routes_of(self, element: Element) -> list[tuple[float, Route]]:
         """Return the routes of a vehicle, trip or flow with their weights; none between districts or junctions."""
-        own = [each for each in element if each.tag in ("route", "routeDistribution")]
-        for each in element:
-            self.skipped[f"elements <{each.tag}> of {element.tag}"] += each not in own
-        if own:
+        if own := [each for each in element if each.tag in ROUTES]:
             return self._choices(own[0], "route", name(element))
         if "route" in element.attrib:
             return self._named("route", element.attrib["route"], element)

@@ -57,7 +57,11 @@ def number(element: Element, key: str, default: float | None = None, low: float 
     """Return an attribute as a number of at least ``low``, or ``above`` it; ValueError for any other."""
     if default is not None and key not in element.attrib:
         return default
-    value = text(element, key)
+    return parsed(text(element, key), element, key, low, above)
+
+
+def parsed(value: str, element: Element, key: str, low: float, above: bool = False) -> float:
+    """Return a word of an attribute as ``number`` returns the whole of it; ValueError as there."""
     with suppress(ValueError):
         if low <= (x := float(value)) < 1e12 and not (above and x == low):
             return x
