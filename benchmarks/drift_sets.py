@@ -32,8 +32,8 @@ from benchmarks import command, rows_of, table  # noqa: E402
 from idm_env.data import Trajectories, episodes  # noqa: E402
 from idm_env.drift.estimate import estimate, usual  # noqa: E402
 from idm_env.drift.kinds import behind_a_record, tell  # noqa: E402
+from idm_env.drift.linear import stacked  # noqa: E402
 from idm_env.effects import DRIFTS, AccelNoise, Effect, PerceptionNoise, Wander  # noqa: E402
-from idm_env.fitting.batch import Batch  # noqa: E402
 from idm_env.fitting.problem import IDM_NAMES  # noqa: E402
 from idm_env.jobs.progress import OnProgress, silent  # noqa: E402
 from idm_env.jobs.workers import HERE, Workers  # noqa: E402
@@ -120,8 +120,8 @@ def scored(part: Part, on_progress: OnProgress = silent) -> dict[str, Any]:
         "sigma": sigma, "memory_time": memory_time, "one_of": None, "gain": {},
     }  # fmt: skip
     if only_hidden:
-        batch, raw = (Batch.stack(x, substeps=1) for x in (smooth, measured))
-        estimates = estimate(behind_a_record(batch.dt, drift), batch, IDM_NAMES, usual(IDM_NAMES), measured=raw)
+        batch, raw = (stacked(x) for x in (smooth, measured))
+        estimates = estimate(behind_a_record(batch.step, drift), batch, IDM_NAMES, usual(IDM_NAMES), measured=raw)
     else:
         drift_of_set = tell(smooth, measured, DRIFTS)
         estimates, row["one_of"], row["gain"] = drift_of_set.found[drift.name], drift_of_set.one_of, drift_of_set.gain

@@ -212,8 +212,8 @@ def estimate(
     """Estimate σ and τ of every drifting effect of the simulator, and the noise of measurement, on measured drivers.
 
     Args:
-        simulator: One step per sample; ``midpoint``, so that no step's delay is taken for a driver's.
-        batch: Drivers and those around them, smoothed, one sample per step (``substeps=1``).
+        simulator: With the step of ``batch``; ``midpoint``, so that no step's delay is taken for a driver's.
+        batch: Drivers and those around them, smoothed (``linear.stacked``).
         free: Full names of the parameters in which drivers differ.
         theta: Their logarithms [rows, p] or [p] as far as known before: what is usual, or of a calibration.
         spread: How well ``theta`` is known, one number or [p]; 0 for sure.
@@ -264,8 +264,7 @@ def _path(around: Likelihood, settings: DriftSettings) -> Path:
     mean, own, path = around.filtered(settings)[0], len(settings.spread), around.path
     last = mean[around.length - 1, np.arange(len(around.length)), 2 : 2 + own]
     before = path.level[0, :, :own]
-    theta = path.theta + np.clip(last, before - LONGEST, before + LONGEST)
-    theta = np.clip(theta, *around.drivers.bounds)
+    theta = np.clip(path.theta + np.clip(last, before - LONGEST, before + LONGEST), *around.drivers.bounds)
     level = np.zeros_like(path.level)
     level[..., :own] = theta - path.theta
     mean, covariance, _ = around.centred(theta).filtered(replace(settings, spread=np.zeros(own)))
@@ -276,9 +275,8 @@ def predicted(path: Path, settings: DriftSettings, dt: float, mean: np.ndarray, 
     """Return a path with gap and speed as filtered, and drifts as foreseen one sample earlier."""
     own = len(settings.spread)
     decay, level, unsure = np.exp(-dt / settings.memory_time), path.level.copy(), np.zeros_like(path.unsure)
-    reach = 3.0 * settings.sigma
     level[..., own:] = 0.0
-    level[1:, :, own:] = np.clip(decay * mean[:-1, :, 2 + own :], -reach, reach)
+    level[1:, :, own:] = np.clip(decay * mean[:-1, :, 2 + own :], -3.0 * settings.sigma, 3.0 * settings.sigma)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)[:-1, :, 2 + own :]
     unsure[1:] = np.sqrt(settings.sigma**2 + decay**2 * (np.maximum(variance, 0.0) - settings.sigma**2))
     gap, speed = np.maximum(mean[..., 0], 0.2), np.maximum(mean[..., 1], 0.0)

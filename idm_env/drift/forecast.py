@@ -7,8 +7,7 @@ import numpy as np
 import torch
 
 from idm_env.drift.estimate import DriftSettings, Likelihood, predicted
-from idm_env.drift.linear import MeasuredDrivers, Path
-from idm_env.fitting.batch import Batch
+from idm_env.drift.linear import MeasuredDrivers, Path, stacked
 from idm_env.types import mapped
 
 
@@ -46,7 +45,7 @@ def _chunk(
     starts: list[tuple[int, int]], steps: int, count: int, seed: int,
 ) -> np.ndarray:  # fmt: skip
     simulator, d = drivers.simulator, drivers.driver
-    batch = Batch.stack([drivers.batch.episodes[r].part(t, t + steps + 1) for r, t in starts], substeps=1)
+    batch = stacked(drivers.batch.episodes[r].part(t, t + steps + 1) for r, t in starts)
     random = np.random.default_rng(seed)
     rows, samples = np.array([r for r, _ in starts]), np.array([t for _, t in starts])
     values, vectors = np.linalg.eigh(levels[1][samples, rows])
@@ -67,7 +66,7 @@ def _chunk(
     inputs = mapped(lambda x: x.unsqueeze(1), dict(batch.inputs(simulator.without(*simulator.draws))))
     inputs = simulator.drawn(state.speed, inputs, batch.steps, seed)
     _, trajectory = simulator.rollout(state, inputs, params, batch.steps)
-    gap = trajectory.gap[..., d].numpy()
+    gap = trajectory.gap[batch.substeps - 1 :: batch.substeps, ..., d].numpy()
     return np.pad(gap, [(0, steps - len(gap)), (0, 0), (0, 0)], constant_values=np.nan)
 
 

@@ -13,8 +13,7 @@ from scipy.stats import t as student
 from idm_env.data import Episode
 from idm_env.drift import forecast
 from idm_env.drift.estimate import Estimate
-from idm_env.drift.linear import MeasuredDrivers
-from idm_env.fitting.batch import Batch
+from idm_env.drift.linear import MeasuredDrivers, stacked
 from idm_env.fitting.problem import IDM_NAMES
 
 HORIZONS_S = (1.0, 5.0, 10.0)
@@ -54,7 +53,7 @@ def scores(
     the draws hold. ``widening`` is the factor by which such a band would hold 90 %; ``widened_90_percent`` is what
     they hold widened by that of the other drivers (None of a single driver).
     """
-    batch, raw = (Batch.stack(x, substeps=1) for x in (smooth, measured))
+    batch, raw = (stacked(x) for x in (smooth, measured))
     dt, longest = smooth[0].dt, HORIZONS_S[-1]
     begins = [np.arange(FIRST_S, (len(e) - 1) * dt - longest, EVERY_S) for e in smooth]
     starts = [(r, round(t / dt)) for r, times in enumerate(begins) for t in times]

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from idm_env.data import Episode
 from idm_env.drift.estimate import Estimate, estimate, usual
-from idm_env.drift.linear import MeasuredDrivers
+from idm_env.drift.linear import MeasuredDrivers, stacked
 from idm_env.effects import DRIFTS, IDM, Brakes, Effect, Replay
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.problem import IDM_NAMES
@@ -24,6 +24,8 @@ LEAST = 0.1
 """Share of the usual σ below which drift is what smoothing and steps leave, and nobody's."""
 PAIR = ("wander", "accel_noise")
 """Drifts that are tried together: one forecasts best at 1 s, the other at 10 s."""
+PAIRED = 30.0
+"""Log-likelihood by which two processes must beat the better one: a wandering T alone gains up to 28, both 26 to 71."""
 APART = 5.0
 """Log-likelihood by which the best sort must beat another to be told from it."""
 
@@ -76,7 +78,7 @@ class _Sort:
 
     @property
     def simulator(self) -> Simulator:
-        return behind_a_record(self.smooth.dt, *self.kinds)
+        return behind_a_record(self.smooth.step, *self.kinds)
 
 
 def _estimated(sort: _Sort, progress: OnProgress) -> dict[str, Tensor]:
@@ -90,8 +92,8 @@ def tell(
     """Estimate every sort of drift on episodes, smoothed and as measured, and say which one it is.
 
     A wandering time gap and noise of the acceleration are tried together, too: two processes are told only where they
-    beat the best single one as that has to beat none. The search of a sort that comes out less likely than with
-    fewer of its processes, or none, went astray: it is not estimated.
+    beat the best single one by ``PAIRED``. The search of a sort that comes out less likely than with fewer of its
+    processes, or none, went astray: it is not estimated.
 
     Args:
         smooth: Drivers behind leaders, smoothed.
@@ -101,7 +103,7 @@ def tell(
         executor: Whoever estimates the sorts, a part each.
         on_progress: Called with the name, done, total and the log-likelihood.
     """
-    batch, raw = (Batch.stack(x, substeps=1) for x in (smooth, measured))
+    batch, raw = (stacked(x) for x in (smooth, measured))
     both = tuple(kind for name in PAIR for kind in kinds if kind.name == name)
     each = [(), *((kind,) for kind in kinds), *([both] if len(both) > 1 else [])]
     sorts = [_Sort(processes, batch, raw) for processes in each]
@@ -124,7 +126,7 @@ def tell(
     if answer.verdict == "cannot_tell":
         return answer
     singles = [n for n in order if len(estimates[n].drivers.drifts) == 1]
-    if singles and answer.gain[order[0]] - answer.gain[singles[0]] < FOUND:
+    if singles and answer.gain[order[0]] - answer.gain[singles[0]] < PAIRED:
         order = singles
     best = order[0]
     usual_sigma = {kind.name: catalogue((kind,))[f"{kind.name}.sigma"].default for kind in kinds}

@@ -16,7 +16,7 @@ from idm_env import compat
 from idm_env.envs.batch import Batch
 from idm_env.envs.info import begun, single
 from idm_env.envs.recording import Recorder
-from idm_env.envs.settings import RENDER_MODES, Settings, affordable, reset_options, settings
+from idm_env.envs.settings import PICTURES, Settings, affordable, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, observation_box
 from idm_env.envs.unrolled import Unrolled, unroll
 from idm_env.tasks import Task
@@ -227,10 +227,7 @@ class DiffIDMEnv(Face, gymnasium.Env):
         ValueError: For a value that cannot be; in one line, with value, rule and cure.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012  (Gymnasium declares it so)
-        "render_modes": list(RENDER_MODES),
-        "render_fps": 10,
-    }
+    metadata: dict[str, Any] = {**PICTURES}  # noqa: RUF012  (Gymnasium declares it so)
 
     def __init__(self, render_mode: str | None = None, **keywords: Any) -> None:
         limit = asked_of_make()

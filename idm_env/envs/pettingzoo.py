@@ -26,7 +26,7 @@ from idm_env.envs.batch import Batch, Outcome
 from idm_env.envs.gym import Pictures
 from idm_env.envs.info import ids
 from idm_env.envs.network_faces import network_parallel_env
-from idm_env.envs.settings import RENDER_MODES, reset_options, settings
+from idm_env.envs.settings import PICTURES, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, numpy_dtype, observation_box
 from idm_env.tasks import is_on_network
 from idm_env.validation import shown, whole
@@ -52,12 +52,7 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
         ValueError: In one line, for values that cannot be, and for actions that are missing or not finite.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012  (PettingZoo declares it so)
-        "name": "diffidm_v0",
-        "render_modes": list(RENDER_MODES),
-        "is_parallelizable": True,
-        "render_fps": 10,
-    }
+    metadata: dict[str, Any] = {"name": "diffidm_v0", "is_parallelizable": True, **PICTURES}  # noqa: RUF012
 
     def __new__(cls, **keywords: Any) -> Any:
         """Return the environment of a task: of ``signals`` and ``junction`` that of networks."""

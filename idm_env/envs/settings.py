@@ -20,6 +20,8 @@ from idm_env.validation import nearest, one_of, shown
 OUTPUTS = ("numpy", "torch")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 RENDER_MODES = ("rgb_array", "human", "rgb_array_list")
+PICTURES = {"render_modes": list(RENDER_MODES), "render_fps": 10}
+"""What ``metadata`` of an environment says of pictures."""
 INFO: tuple[str, ...] = ("accel", "command", "failsafe", "crash", "rewards", "vehicle_id", "lane_changes")
 INFO += ("lane_refusals", "present", "queued", "inside", "outflow", "ramp", "standing", "co2", "travel", "stops")
 TENSORS, SPACES, ROW_BYTES = 25, 8, 400

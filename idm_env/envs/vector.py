@@ -15,7 +15,7 @@ from torch import Tensor
 from idm_env.envs.batch import Outcome
 from idm_env.envs.gym import Face
 from idm_env.envs.info import Rows
-from idm_env.envs.settings import RENDER_MODES, affordable, reset_options, settings
+from idm_env.envs.settings import PICTURES, affordable, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, observation_box
 from idm_env.validation import shown, whole
 
@@ -38,11 +38,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         ValueError: For a value that cannot be; in one line, with value, rule and cure.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012  (Gymnasium declares it so)
-        "render_modes": list(RENDER_MODES),
-        "render_fps": 10,
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }
+    metadata: dict[str, Any] = {**PICTURES, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012  (as gymnasium's)
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None, **keywords: Any) -> None:
         own = settings(render_mode=render_mode, **keywords)

@@ -117,11 +117,11 @@ def test_sorts_of_drift_are_told_apart(drift: Effect, sigma: float, verdict: str
 
 
 def test_two_processes_at_once_are_told_where_both_are_there() -> None:
-    smooth, raw = (x[::3] for x in both(driven(Wander(), 0.3, 12.0, AccelNoise())))
+    smooth, raw = (x[::2] for x in both(driven(Wander(), 0.3, 12.0, AccelNoise())))
     told = tell(smooth, raw, (Wander(), AccelNoise()))
     assert told.one_of == ("wander and accel_noise",) and told.verdict == "named"
     pair = told.found[told.one_of[0]]
-    assert told.gain[told.one_of[0]] > max(told.gain["wander"], told.gain["accel_noise"]) + kinds.FOUND
+    assert told.gain[told.one_of[0]] > max(told.gain["wander"], told.gain["accel_noise"]) + kinds.PAIRED
     assert np.all(np.abs(np.log(pair.settings.sigma / [0.3, 0.25])) < 0.6), pair.settings
     model = model_of(pair)
     assert [e.name for e in model.effects] == ["idm", "wander", "accel_noise", "brakes"]
@@ -132,6 +132,16 @@ def test_two_processes_at_once_are_told_where_both_are_there() -> None:
     assert row["sigma"] == pair.settings.sigma.tolist() and row["tau_s"] == pair.settings.memory_time.tolist()
     shown = tables({"kept_back": {"drivers": 0, "scores": []}, "sorts": [row]})
     assert [r["sigma"] for r in shown.values() for r in r] == [", ".join(f"{x:.4g}" for x in pair.settings.sigma)]
+
+
+def test_a_step_between_samples_is_the_drivers_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a step of 0.4 s leaves of finer ones was told as a second process, by 70."""
+    monkeypatch.setattr(f"{__name__}.DT", 0.1)
+    smooth, raw = (list(episodes(driven(Wander(), 0.3, 12.0), smooth=x, dt=0.4))[::3] for x in (True, False))
+    told = tell(smooth, raw, (Wander(), AccelNoise()))
+    assert told.one_of == ("wander",), told.gain
+    rows = told.found["wander"].table()
+    assert rows[0]["low"] < 0.3 < rows[0]["high"] and rows[1]["low"] < 12.0 < rows[1]["high"]
 
 
 def words_of_the_first(text: str) -> int:
