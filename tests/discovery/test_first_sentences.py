@@ -66,6 +66,21 @@ def test_what_noise_explains_is_short(said: Verdict) -> None:
     assert len(first_of(text).split()) <= 30, text
 
 
+@pytest.mark.parametrize("laws", [2, 3, 6])
+@pytest.mark.parametrize("classes", [(), ("Tesla Model 3", "Tesla Model X", "Jaguar I Pace")], ids=["none", "three"])
+def test_the_laws_of_several_kinds_are_short(classes: tuple[str, ...], laws: int) -> None:
+    """However many laws and classes there are; every driver is counted."""
+    title, counts, column = SimpleNamespace(title=LONGEST), [10 * n + 1 for n in range(laws)], "vehicle_name"
+    fleet = SimpleNamespace(
+        laws=[title] * laws, counts=counts, group=range(sum(counts)), against=dict.fromkeys(ERRORS, BETTER),
+        classes=[classes] * laws if classes else [], column=column if classes else "",
+    )  # fmt: skip
+    text = words.fleet_first(fleet)  # type: ignore[arg-type]
+    assert_short(text)
+    assert text.count("Jaguar") == (laws if classes else 0)
+    assert sum(map(int, re.findall(r"(\d+) (?:of|by)", first_of(text)))) == sum(counts)
+
+
 @pytest.mark.parametrize("name", CANDIDATES)
 def test_a_named_effect_is_short(name: str) -> None:
     cls = ALL[name]
