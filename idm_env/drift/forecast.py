@@ -3,12 +3,19 @@
 Shapes: levels are ``[T, rows, p + k]``, drawn futures ``[steps, draws, starts]``.
 """
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from idm_env.drift.estimate import DriftSettings, Likelihood, predicted
 from idm_env.drift.linear import MeasuredDrivers, Path, stacked
+from idm_env.effects import AccelNoise
 from idm_env.types import mapped
+
+NO_MEMORY_S = 1e-3
+"""Memory time (s) of noise that is new in every step."""
 
 
 def followed(
@@ -31,8 +38,9 @@ def draw_gaps(
 ) -> np.ndarray:  # fmt: skip
     """Return ``count`` drawn futures of the gap [steps, count, starts], each start a (row, sample).
 
-    They begin at the measured state, with a draw of what is known of the ``levels`` (of ``followed``) then. Beyond the
-    end of a record a future means nothing.
+    They begin at the measured state, with a draw of what is known of the ``levels`` (of ``followed``) then. Where no
+    drift is one of the acceleration, this has the white noise of the settings (``jitter``). Beyond the end of a record
+    a future means nothing.
     """
     steps = round(seconds / drivers.batch.dt)
     some = range(0, len(starts), 64)
@@ -44,19 +52,21 @@ def _chunk(
     drivers: MeasuredDrivers, settings: DriftSettings, theta: np.ndarray, levels: tuple[np.ndarray, np.ndarray],
     starts: list[tuple[int, int]], steps: int, count: int, seed: int,
 ) -> np.ndarray:  # fmt: skip
-    simulator, d = drivers.simulator, drivers.driver
+    simulator, d, one = drivers.simulator, drivers.driver, torch.ones((), dtype=torch.float64)
     batch = stacked(drivers.batch.episodes[r].part(t, t + steps + 1) for r, t in starts)
-    random = np.random.default_rng(seed)
-    rows, samples = np.array([r for r, _ in starts]), np.array([t for _, t in starts])
+    rows, samples = np.array(starts).T
     values, vectors = np.linalg.eigh(levels[1][samples, rows])
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-    normals = random.standard_normal((count, *levels[0].shape[2:], len(starts)))
+    normals = np.random.default_rng(seed).standard_normal((count, *levels[0].shape[2:], len(starts)))
     level = levels[0][samples, rows] + np.einsum("rij,njr->nri", root, normals)
     own = len(drivers.free)
     params = drivers.params(torch.tensor(np.clip(theta[rows] + level[..., :own], *drivers.bounds)))
-    for j, name in enumerate(drivers.drifts):
-        one = torch.ones((), dtype=torch.float64)
-        params[name] = {**params[name], "sigma": settings.sigma[j] * one, "memory_time": settings.memory_time[j] * one}
+    noise = dict(zip(drivers.drifts, zip(settings.sigma, settings.memory_time, strict=True), strict=True))
+    if AccelNoise.kind not in noise:  # the filter's white acceleration
+        simulator = replace(simulator, effects=(*simulator.effects, AccelNoise()))
+        noise[AccelNoise.kind] = settings.jitter / math.sqrt(simulator.dt), NO_MEMORY_S
+    for name, (sigma, memory_time) in noise.items():
+        params[name] = {"sigma": sigma * one, "memory_time": memory_time * one}
     state = batch.start(simulator, params)
     memory = {
         name: torch.tensor(level[..., own + j] / settings.sigma[j]).unsqueeze(-1).expand(state.speed.shape).contiguous()
