@@ -106,6 +106,8 @@ def test_a_law_with_strengths_of_each_drivers_own_says_which_way_they_lie(stiffn
     own = Law(base_named("idm"), model, None, errors(UP, BETTER, SAME))  # type: ignore[arg-type]
     values = [stiffness if name == "gap_stiffness" else p.default for name, p in model.catalogue.of_driver]
     theta = np.log(np.array(values)) + np.zeros((5, 1))
+    by_mean_driver = replace(BETTER, high=1.01, driver=(0.95, 0.91, 0.999))
+    assert own.is_better and not own._replace(against=errors(BETTER, by_mean_driver, SAME)).is_better
     first = words.law_first(own, "IDM", SimpleNamespace(model=model, theta=theta, row_group=np.arange(5)))  # type: ignore[arg-type]
     told = ALL["gap_stiffness"].wording[finding == "more"]
     assert first.startswith(f"{told[:1].upper()}{told[1:]}"[:20]) and "With strengths of each driver's own" in first
