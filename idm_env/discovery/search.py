@@ -223,8 +223,8 @@ class Search:
         have, result = {t.label: t for t in solution.model.terms}, []
         past = any(t.past for t in have.values())  # of which there is one in a model
         screened = [(t, *_line(responses, t)) for t in curves if t.label not in have and not (past and t.past)]
-        # A straight line has no end where a run is far from it: a loss counts for no more than the largest gain.
-        promises = [float(np.maximum(gains, -gains.max()).mean()) for *_, gains in screened]
+        # A straight line has no end where a run is far from it: a loss beyond the largest gain tells nothing.
+        promises = [float(np.where(gains < -gains.max(), 0.0, gains).mean()) for *_, gains in screened]
         for i, number in enumerate(np.argsort(np.negative(promises), kind="stable")):
             term, start, gains = screened[number]
             faint = promises[number] < max(worth, NEAR * max(promises)) and (

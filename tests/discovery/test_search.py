@@ -125,13 +125,16 @@ def test_the_run_that_decides_is_held_out_by_a_solution_on_the_others() -> None:
 
 
 def test_a_curve_is_fitted_although_its_line_misses_one_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even where a name gains as much as its mean with that loss; one that loses everywhere is not."""
     searching, null = begun(made(31, runs=4, followers=1, seconds=60.0), "drag")
     gains = {"speed": np.array([0.1, 0.1, 0.1, -0.8]), "gap": np.array([0.0, 0.02, 0.0, 0.0])}
+    gains |= {"closing_speed": np.full(4, -0.1)}
     curves = [terms.curve("time_gap", c, 0.0, 5.0, 4) for c in gains]
     monkeypatch.setattr(search, "_line", lambda responses, term: (np.zeros(4), gains[term.coordinate]))
     monkeypatch.setattr(Search, "_nested", lambda self, solution, term, *rest: Scored(term, null, np.ones(4)))
-    scored = searching._curves(null, places.respond(searching.problem, null), np.ones(4), curves)
-    assert {s.term.coordinate: s.solution is not None for s in scored} == {"speed": True, "gap": False}
+    scored = searching._curves(null, places.respond(searching.problem, null), np.ones(4), curves, 0.06)
+    fitted = {s.term.coordinate: s.solution is not None for s in scored}
+    assert fitted == {"speed": True, "gap": False, "closing_speed": False}
 
 
 def test_a_law_alone_has_a_loop_of_its_own(platoon: Records) -> None:
