@@ -332,8 +332,9 @@ def agreement(ladder: Ladder | None, leading: Term | None) -> list[str]:
 
 def fleet_first(fleet: Kinds) -> str:
     """Return the drivers of every law, three laws at most, the classes, and an error's change against one model."""
-    titles, whole = [law.title for law in fleet.laws], f"{fleet.counts[0]} of {len(fleet.group)} drivers are predicted"
-    counts = [f"{whole} best by {titles[0]}", *map("{} by {}".format, fleet.counts[1:3], titles[1:3])]
+    titles = [law.title for law in fleet.laws]
+    counts = [f"{fleet.counts[0]} of {len(fleet.group)} drivers are predicted best by {titles[0]}"]
+    counts += [f"{count} by {title}" for count, title in zip(fleet.counts[1:3], titles[1:3], strict=True)]
     counts += [f"{sum(fleet.counts[3:])} by others"] if titles[3:] else []
     classes = [f"{' or '.join(x)} by {title}" for x, title in zip(fleet.classes, titles, strict=bool(fleet.column))]
     which = f" Of {fleet.column}, {'; '.join(classes)}." if fleet.column else ""

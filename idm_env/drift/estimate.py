@@ -275,8 +275,9 @@ def predicted(path: Path, settings: DriftSettings, dt: float, mean: np.ndarray, 
     """Return a path with gap and speed as filtered, and drifts as foreseen one sample earlier."""
     own = len(settings.spread)
     decay, level, unsure = np.exp(-dt / settings.memory_time), path.level.copy(), np.zeros_like(path.unsure)
+    reach = 3.0 * settings.sigma
     level[..., own:] = 0.0
-    level[1:, :, own:] = np.clip(decay * mean[:-1, :, 2 + own :], -3.0 * settings.sigma, 3.0 * settings.sigma)
+    level[1:, :, own:] = np.clip(decay * mean[:-1, :, 2 + own :], -reach, reach)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)[:-1, :, 2 + own :]
     unsure[1:] = np.sqrt(settings.sigma**2 + decay**2 * (np.maximum(variance, 0.0) - settings.sigma**2))
     gap, speed = np.maximum(mean[..., 0], 0.2), np.maximum(mean[..., 1], 0.0)

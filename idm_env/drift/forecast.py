@@ -68,10 +68,8 @@ def _chunk(
     for name, (sigma, memory_time) in noise.items():
         params[name] = {"sigma": sigma * one, "memory_time": memory_time * one}
     state = batch.start(simulator, params)
-    memory = {
-        name: torch.tensor(level[..., own + j] / settings.sigma[j]).unsqueeze(-1).expand(state.speed.shape).contiguous()
-        for j, name in enumerate(drivers.drifts)
-    }
+    units = torch.tensor(np.moveaxis(level[..., own:] / settings.sigma, -1, 0)).unsqueeze(-1)
+    memory = dict(zip(drivers.drifts, units.expand(-1, *state.speed.shape).contiguous(), strict=True))
     state = state._replace(memory={**state.memory, **memory}, step=state.step.expand(state.speed.shape[:-1]))
     inputs = mapped(lambda x: x.unsqueeze(1), dict(batch.inputs(simulator.without(*simulator.draws))))
     inputs = simulator.drawn(state.speed, inputs, batch.steps, seed)
